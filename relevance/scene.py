@@ -141,9 +141,7 @@ class Box:
         """Whether the point (x, y) lies over its footprint."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         dx, dy = x - self.position[0], y - self.position[1]
-        return (
-            abs(c * dx + s * dy) <= self.size[0] / 2 and abs(c * dy - s * dx) <= self.size[1] / 2
-        )
+        return abs(c * dx + s * dy) <= self.size[0] / 2 and abs(c * dy - s * dx) <= self.size[1] / 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_CHECKED)
@@ -275,7 +273,9 @@ class Action:
         return [part for part in (self.name, self.object, self.support) if part is not None]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False, config={"arbitrary_types_allowed": True})
+@dataclass(
+    frozen=True, slots=True, kw_only=True, eq=False, config={"arbitrary_types_allowed": True}
+)
 class Phase:
     """One motion of the arm, ending at a switch (grasp or release) or in the final retreat.
 
@@ -366,9 +366,7 @@ def _check_boxes(objects: tuple[Box, ...], table: Table) -> None:
                 f"found {box.position[2]:g}"
             )
         for other in objects[:i]:
-            depth = -max(
-                box.bottom - other.top, other.bottom - box.top, footprint_gap(box, other)
-            )
+            depth = -max(box.bottom - other.top, other.bottom - box.top, footprint_gap(box, other))
             if depth > CONTACT_TOLERANCE:
                 raise SceneError(
                     f"{where}: overlaps {other.name!r} by {1000 * depth:.1f} mm, "

@@ -1,0 +1,24 @@
+"""Logic-Geometric Programming over pick and place: `plan(scene, goal)`."""
+
+from relevance.planner.problem import Counts, Seconds
+from relevance.planner.search import (
+    GUIDES,
+    PLANNER_VERSION,
+    Guide,
+    PlannerConfig,
+    PlanResult,
+    Scorer,
+    plan,
+)
+
+__all__ = [
+    "GUIDES",
+    "PLANNER_VERSION",
+    "Counts",
+    "Guide",
+    "PlanResult",
+    "PlannerConfig",
+    "Scorer",
+    "Seconds",
+    "plan",
+]

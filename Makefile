@@ -1,0 +1,62 @@
+# make demo    install, run the whole pipeline on a small dataset, say where the report is
+# make test    install with the test tools, run the default tests
+# make check   formatting, lint, types, and the order of imports
+# make deploy  register the flows with a running Prefect server
+
+PYTHON ?= python3
+DATASET ?= data/demo
+PRESET ?= demo
+WORKERS ?= $(shell nproc)
+TESTS ?= tests
+
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+
+.PHONY: demo test test-slow check format deploy clean
+.DELETE_ON_ERROR:
+
+# What the demo tells Prefect stays in this folder. Killed or done, it may be run again: finished
+# shards, the last training state and the evaluated shards are taken up.
+demo: .venv/installed
+	PREFECT_HOME="$(CURDIR)/.prefect" $(BIN)/relevance demo \
+		--dataset "$(DATASET)" --preset "$(PRESET)" --workers "$(WORKERS)"
+
+# One thread a process: two test processes share the cores.
+test: .venv/installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --durations 10 $(TESTS)
+
+test-slow: .venv/installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow --durations 10 $(TESTS)
+
+check: .venv/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/python -m pytest -q tests/test_structure.py
+
+format: .venv/installed-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+deploy: .venv/installed
+	$(BIN)/prefect work-pool inspect relevance >/dev/null 2>&1 \
+		|| $(BIN)/prefect work-pool create relevance --type process
+	$(BIN)/prefect --no-prompt deploy --all
+
+# Some Debian systems have no ensurepip; then the system's pip fills the environment.
+.venv/bin/python:
+	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed" * (sys.version_info < (3, 11)))'
+	rm -rf .venv
+	$(PYTHON) -m venv .venv || ( rm -rf .venv && $(PYTHON) -m venv --without-pip .venv \
+		&& $(PYTHON) -m pip --python .venv/bin/python install --quiet pip )
+
+.venv/installed: pyproject.toml | .venv/bin/python
+	$(PIP) install -e .
+	touch $@
+
+.venv/installed-dev: pyproject.toml | .venv/bin/python
+	$(PIP) install -e ".[dev]"
+	touch .venv/installed $@
+
+clean:
+	rm -rf .venv .prefect .pytest_cache .ruff_cache .hypothesis build dist

@@ -1,0 +1,93 @@
+"""What people and programs see: tables, strict JSON, CSV and progress bars (rich)."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+Format = Literal["table", "json", "csv"]
+
+console = Console(stderr=True)
+
+
+class UsageError(ValueError):
+    """A command line that asks for what cannot be."""
+
+
+def to_json(value: Any) -> str:
+    """One line of strict JSON; NaN and infinities, which JSON has not, become null."""
+
+    def strict(value: Any) -> Any:
+        if isinstance(value, float) and not math.isfinite(value):
+            return None
+        if isinstance(value, Mapping):
+            return {str(key): strict(item) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [strict(item) for item in value]
+        return value
+
+    return json.dumps(strict(value), default=str, allow_nan=False)
+
+
+def show(
+    columns: Sequence[str], rows: Iterable[Sequence[Any]], format: Format, title: str | None = None
+) -> None:
+    """Print rows: a table, one JSON list of objects, or CSV with a header."""
+    if format == "json":
+        print(to_json([dict(zip(columns, row, strict=True)) for row in rows]))
+    elif format == "csv":
+        writer = csv.writer(sys.stdout, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(
+            [to_json(cell) if isinstance(cell, list | dict) else cell for cell in row]
+            for row in rows
+        )
+    else:
+        table = Table(*columns, title=title, title_justify="left")
+        for row in rows:
+            table.add_row(*[f"{x:.6g}" if isinstance(x, float) else str(x) for x in row])
+        out = Console()
+        # Cut off by nothing when it goes into a file or a pipe.
+        out.print(table, width=None if out.is_terminal else 100_000, markup=False)
+
+
+def say(text: str) -> None:
+    """A line for the person, on stderr; stdout is for results."""
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def bars() -> Progress:
+    """Progress bars on stderr; nothing at all unless that is a terminal."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+@contextmanager
+def bar(what: str, quiet: bool = False) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on a terminal; yields progress(done, total)."""
+    with bars() as drawn:
+        row = drawn.add_task(what, total=None, visible=not quiet)
+        yield lambda done, total: drawn.update(row, completed=done, total=total)

@@ -1,0 +1,237 @@
+"""The labelled scenes of a split, decoded once, and batches of them for training.
+
+Scenes and labels come from the shards through `store.Dataset`; every scene is decoded once
+and kept as uint8, in memory or, when it would not fit, in a file mapped into memory.
+
+Shape suffixes: S scenes of a split, K goals of a predicate, B scenes and G goals of a batch,
+N objects (padded), H and W height and width in pixels, h and w the same at stride 4.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from relevance.models import DECIMETRE, GEOMETRY, PATCH, STRIDE, half_extents, mirrored
+from relevance.scene import Camera, Predicate, Scene
+from relevance.store import Dataset, DatasetError
+
+MIRRORED = {
+    Predicate.ON_THE_LEFT: Predicate.ON_THE_RIGHT,
+    Predicate.ON_THE_RIGHT: Predicate.ON_THE_LEFT,
+}
+"""What a predicate becomes in the mirror; the others stay."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Goals:
+    """The labelled goals of one predicate, ordered by scene."""
+
+    pairs: np.ndarray
+    """(K, 2) int64: subject and reference, by place in the scene."""
+    relevant: np.ndarray
+    """(K, N) bool."""
+    labelled: np.ndarray
+    """(K, N) bool; False for padding and for objects without a label."""
+    first: np.ndarray
+    """(S + 1,) int64: the goals of scene i are first[i] to first[i + 1]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Examples:
+    """The labelled scenes of a split, decoded, and the goals of each predicate on them."""
+
+    images: np.ndarray
+    """(S, H, W, 3) uint8."""
+    views: np.ndarray
+    """(S, N, 32, 32, 3) uint8."""
+    cells: np.ndarray
+    """(S, H / 4, W / 4) uint8: the mask at the centres of the stride-4 cells."""
+    geometry: np.ndarray
+    """(S, N, GEOMETRY) float32, decimetres."""
+    present: np.ndarray
+    """(S, N) bool."""
+    goals: dict[Predicate, Goals]
+
+    def scenes(self, predicates: Sequence[Predicate]) -> np.ndarray:
+        """Indices of the scenes that have a goal of one of the predicates."""
+        counts = sum(np.diff(self.goals[predicate].first) for predicate in predicates)
+        return np.flatnonzero(counts)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Batch:
+    """Some scenes and some of their goals, for one or more predicates in turn."""
+
+    image: Tensor
+    """(B, 3, H, W) uint8."""
+    views: Tensor
+    """(B, N, 3, 32, 32) uint8."""
+    present: Tensor
+    """(B, N) bool."""
+    cells: Tensor
+    """(B, h, w) uint8."""
+    geometry: Tensor
+    """(B, N, GEOMETRY)."""
+    turns: tuple[tuple[Predicate, Tensor, Tensor, Tensor], ...]
+    """Predicate, goals (B, G, 2), relevant (B, G, N), labelled (B, G, N; False for padding)."""
+
+
+def load_examples(
+    dataset: Dataset,
+    split: str,
+    *,
+    camera: Camera,
+    policy: str = "found",
+    ambiguous: bool = True,
+    cache_bytes: int = 1_500_000_000,
+    folder: Path | None = None,
+) -> Examples:
+    """Read the labels of a split and decode the scenes that they are about.
+
+    Raises DatasetError for a broken file, a label about a scene that is not there, or an image
+    of another size than the camera's. Arrays over `cache_bytes` are mapped from a nameless
+    file in `folder`.
+    """
+    query = """
+        select scene_id, predicate, subject, reference, list(query order by query),
+            list(relevant order by query)
+        from labels where split = ? and policy = ? and (? or not ambiguous)
+        group by all order by all
+    """
+    with dataset.connect() as connection:
+        rows = connection.execute(query, [split, policy, ambiguous]).fetchall()
+    labels: dict[str, list[tuple[Any, ...]]] = {
+        key: list(group) for key, group in groupby(rows, key=lambda row: row[0])
+    }
+    total = len(labels)
+    with dataset.connect() as connection:
+        ((widest,),) = connection.execute("select max(n_objects) from scenes").fetchall()
+    objects = int(widest or 1)
+    images = _array((total, camera.height, camera.width, 3), cache_bytes, folder)
+    views = _array((total, objects, PATCH, PATCH, 3), cache_bytes, folder)
+    cells = np.zeros((total, camera.height // STRIDE, camera.width // STRIDE), np.uint8)
+    geometry = np.zeros((total, objects, GEOMETRY), np.float32)
+    present = np.zeros((total, objects), bool)
+    found: dict[Predicate, list[tuple[int, list[int], np.ndarray, np.ndarray]]] = {}
+    done = 0
+    for sample in dataset.samples(split) if total else ():
+        asked = labels.pop(sample.scene.id, None)
+        if asked is None:
+            continue
+        if sample.image.shape != images.shape[1:]:
+            height, width = sample.image.shape[:2]
+            raise DatasetError(
+                f"{dataset.path}: scene {sample.scene.id}: image is {width}x{height}, "
+                f"expected {camera.width}x{camera.height}"
+            )
+        count = len(sample.scene.objects)
+        images[done], views[done, :count] = sample.image, sample.views
+        cells[done] = sample.mask[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
+        geometry[done, :count] = true_geometry(sample.scene)
+        present[done, :count] = True
+        place = {name: i for i, name in enumerate(sample.scene.names)}
+        for _, predicate, subject, reference, queries, answers in asked:
+            relevant, labelled = np.zeros(objects, bool), np.zeros(objects, bool)
+            index = [place[query] for query in queries]
+            relevant[index], labelled[index] = answers, True
+            pair = [place[subject], place[reference]]
+            found.setdefault(Predicate(predicate), []).append((done, pair, relevant, labelled))
+        done += 1
+    if labels:
+        raise DatasetError(
+            f"{dataset.path}: labels of split {split} name scene {min(labels)}, "
+            "which no image shard holds"
+        )
+    goals = {p: _goals(found[p], total) for p in Predicate if p in found}
+    return Examples(
+        images=images,
+        views=views,
+        cells=cells,
+        geometry=geometry,
+        present=present,
+        goals=goals,
+    )
+
+
+def true_geometry(scene: Scene) -> np.ndarray:
+    """Position, size and footprint half-extents of every box, (N, GEOMETRY), decimetres."""
+    size = torch.tensor([box.size for box in scene.objects], dtype=torch.float64)
+    yaw = torch.tensor([box.yaw for box in scene.objects], dtype=torch.float64)
+    position = torch.tensor([box.position for box in scene.objects], dtype=torch.float64)
+    extents = half_extents(size[:, 0], size[:, 1], yaw)
+    return (torch.cat([position, size, extents], dim=1) / DECIMETRE).numpy().astype(np.float32)
+
+
+def _goals(items: list[tuple[int, list[int], np.ndarray, np.ndarray]], total: int) -> Goals:
+    return Goals(
+        pairs=np.array([item[1] for item in items]),
+        relevant=np.stack([item[2] for item in items]),
+        labelled=np.stack([item[3] for item in items]),
+        first=np.searchsorted([item[0] for item in items], np.arange(total + 1)),
+    )
+
+
+def _array(shape: tuple[int, ...], limit: int, folder: Path | None) -> np.ndarray:
+    """Zeros; in a nameless file, mapped, when larger than `limit` bytes."""
+    if int(np.prod(shape)) <= limit or folder is None:
+        return np.zeros(shape, np.uint8)
+    folder.mkdir(parents=True, exist_ok=True)
+    # The file has no name: it is gone with the process, however that ends.
+    with tempfile.TemporaryFile(dir=folder) as stream:
+        stream.truncate(int(np.prod(shape)))
+        return np.memmap(stream, dtype=np.uint8, mode="r+", shape=shape)
+
+
+def gather(
+    examples: Examples,
+    chosen: np.ndarray,
+    predicates: Sequence[Predicate],
+    *,
+    limit: int | None = None,
+    rng: np.random.Generator | None = None,
+) -> Batch:
+    """These scenes and their goals; at most `limit` goals a scene, drawn by `rng`."""
+    turns = []
+    for predicate in predicates:
+        goals = examples.goals[predicate]
+        first = goals.first.tolist()
+        rows = [np.arange(first[i], first[i + 1]) for i in chosen.tolist()]
+        if limit is not None and rng is not None:
+            rows = [r if len(r) <= limit else np.sort(rng.permutation(r)[:limit]) for r in rows]
+        most = max(1, *(len(r) for r in rows))
+        index = np.zeros((len(chosen), most), int)
+        real = np.zeros((len(chosen), most), bool)
+        for i, r in enumerate(rows):
+            index[i, : len(r)], real[i, : len(r)] = r, True
+        labelled = goals.labelled[index] & real[..., None]
+        arrays = (goals.pairs[index] * real[..., None], goals.relevant[index], labelled)
+        turns.append((predicate, *(torch.from_numpy(a) for a in arrays)))
+    most = int(examples.present[chosen].sum(1).max())  # no wider than this batch needs
+    return Batch(
+        image=torch.from_numpy(examples.images[chosen]).permute(0, 3, 1, 2),
+        views=torch.from_numpy(examples.views[chosen, :most]).permute(0, 1, 4, 2, 3),
+        present=torch.from_numpy(examples.present[chosen, :most]),
+        cells=torch.from_numpy(examples.cells[chosen]),
+        geometry=torch.from_numpy(examples.geometry[chosen, :most]),
+        turns=tuple((p, g, r[..., :most], m[..., :most]) for p, g, r, m in turns),
+    )
+
+
+def in_the_mirror(batch: Batch) -> Batch:
+    """The batch as a mirror shows it: y changes sign, left and right change places."""
+    return replace(
+        batch,
+        image=batch.image.flip(-1),
+        cells=batch.cells.flip(-1),
+        geometry=mirrored(batch.geometry),
+        turns=tuple((MIRRORED.get(turn[0], turn[0]), *turn[1:]) for turn in batch.turns),
+    )

@@ -1,0 +1,1 @@
+"""Inner loops: box distances, native calls and the solvers' linear algebra, in numba."""

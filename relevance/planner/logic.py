@@ -1,0 +1,42 @@
+"""Symbolic side of the search: who can be picked when, and what a sequence of moves means.
+
+A move is the pair pick(o), place(o, support); a plan is an order of distinct objects that ends
+with the goal's subject. Blockers go to the table; the subject goes where the goal says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from relevance.scene import Action, Goal, Predicate, Scene
+
+
+def stacked_on(scene: Scene) -> dict[str, frozenset[str]]:
+    """For each object, the objects that stand directly on it."""
+    return {
+        name: frozenset(box.name for box in scene.objects if box.on == name)
+        for name in scene.names
+    }
+
+
+def goal_blockers(scene: Scene, goal: Goal) -> frozenset[str]:
+    """Objects that must leave before the subject can be placed, whatever the geometry.
+
+    For `on` the reference's top must be free. For every goal the subject may not carry anything.
+    """
+    above = stacked_on(scene)
+    blocking = above[goal.subject]
+    if goal.predicate is Predicate.ON:
+        blocking |= above[goal.reference]
+    return blocking - {goal.subject}
+
+
+def actions(goal: Goal, order: Sequence[str]) -> tuple[Action, ...]:
+    """The action sequence of an order of moved objects, the subject last."""
+    found = []
+    for name in order:
+        last = name == goal.subject
+        support = goal.reference if last and goal.predicate is Predicate.ON else "table"
+        found.append(Action(name="pick", object=name))
+        found.append(Action(name="place", object=name, support=support))
+    return tuple(found)

@@ -1,0 +1,310 @@
+"""Multi-bound tree search over pick and place, and how scores guide it.
+
+Breadth-first by plan length. Each node is tested by the bounds in order of their cost: logic,
+pose, keyframe, path; a refused prefix is dropped with all below it. The level in which a plan
+is found is finished, and the plan of lowest cost counts (rounded, ties by object index), so
+that labels do not depend on the order of search.
+
+`tree` extends every prefix by every object (the paper's uninformed search). `informed` extends
+only by objects that could matter: those that reach into the goal region or into the way of a
+pick that is needed.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from relevance.planner import logic
+from relevance.planner.placement import obstacle
+from relevance.planner.problem import Counts, Motion, Problem, Seconds
+from relevance.scene import Action, Box, Goal, Phase, Pose, Scene, footprint_gap, goal_holds
+
+PLANNER_VERSION = "1"
+COST_TOLERANCE = 1e-3
+"""Costs are compared after rounding to this, rad^2."""
+GUIDES = ("none", "prune", "prune-then-full", "expand", "order")
+Mode = Literal["none", "prune", "prune-then-full", "expand", "order"]
+
+
+class Scorer(Protocol):
+    """Says how relevant each object is."""
+
+    def scores(self, scene: Scene, goal: Goal) -> Mapping[str, float]:
+        """Logit of relevance for every object of the scene."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Guide:
+    """How scores enter the search (DESIGN section 2); goal objects always stay."""
+
+    scorer: Scorer
+    mode: Mode = "prune-then-full"
+    beta: float = 0.0
+    """An object is kept iff its score > -beta; a larger beta keeps more."""
+
+    def __post_init__(self) -> None:
+        if self.mode not in GUIDES:
+            raise ValueError(f"guide {self.mode!r}: expected one of {', '.join(GUIDES)}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannerConfig:
+    """Settings that labels depend on; their hash is stored with every row."""
+
+    search: Literal["tree", "informed"] = "informed"
+    max_actions: int = 6
+    node_limit: int = 20_000
+
+    def __post_init__(self) -> None:
+        if self.search not in ("tree", "informed"):
+            raise ValueError(f"search {self.search!r}: expected tree or informed")
+        if self.max_actions < 2 or self.max_actions % 2:
+            raise ValueError(f"max_actions {self.max_actions}: expected an even number >= 2")
+        if self.node_limit < 1:
+            raise ValueError(f"node_limit {self.node_limit}: expected at least 1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanResult:
+    """What the planner found, and what it cost to find it."""
+
+    goal: Goal
+    status: Literal["solved", "infeasible", "limit"]
+    reason: str = ""
+    actions: tuple[Action, ...] = ()
+    moved: tuple[str, ...] = ()
+    """Moved objects, in order."""
+    final: dict[str, Pose]
+    cost: float = math.nan
+    """Squared joint accelerations, summed over rows, rad^2."""
+    ambiguous: bool = False
+    counts: Counts
+    check_ok: bool = False
+    max_penetration: float = 0.0
+    """Deepest penetration at the sub-steps of the dense check, m."""
+    phases: tuple[Phase, ...] = ()
+    seconds: Seconds
+
+
+class _Limit(Exception):
+    """The node limit was reached."""
+
+
+def plan(
+    scene: Scene,
+    goal: Goal | str,
+    *,
+    config: PlannerConfig = PlannerConfig(),
+    guide: Guide | None = None,
+) -> PlanResult:
+    """Find the shortest sequence of picks and places, and its motion, that makes the goal true.
+
+    Raises SceneError for an unknown predicate or object. A goal that cannot be reached is a
+    result with a reason.
+    """
+    goal = scene.goal(goal)
+    began = time.process_time()
+    if goal_holds(scene.objects, goal):
+        seconds = Seconds(total=time.process_time() - began)
+        return PlanResult(
+            goal=goal, status="solved", final={}, cost=0.0, check_ok=True, counts=Counts(),
+            seconds=seconds,
+        )  # fmt: skip
+    problem = Problem(scene, goal)
+    names, scores = scene.names, None
+    if guide is not None and guide.mode != "none":
+        scored = time.process_time()
+        scores = guide.scorer.scores(scene, goal)
+        problem.seconds.guide = time.process_time() - scored
+    result = None
+    for allowed in _rounds(names, goal, guide, scores):
+        search = _Search(problem, config, allowed, scores if _ordered(guide) else None)
+        result = search.run(began)
+        if result.status == "solved":
+            break
+    assert result is not None
+    return result
+
+
+def _ordered(guide: Guide | None) -> bool:
+    return guide is not None and guide.mode == "order"
+
+
+def _rounds(names, goal: Goal, guide: Guide | None, scores):
+    """The object sets that a guide lets the search move, one after the other."""
+    everything = frozenset(names)
+    if guide is None or scores is None or guide.mode == "order":
+        yield everything
+        return
+    always = {goal.subject, goal.reference}
+    kept = frozenset(n for n in names if scores[n] > -guide.beta or n in always)
+    yield kept
+    if guide.mode == "prune-then-full" and kept != everything:
+        yield everything
+    if guide.mode == "expand":
+        for name in sorted(everything - kept, key=lambda n: -scores[n]):
+            kept |= {name}
+            yield kept
+
+
+class _Search:
+    def __init__(self, problem: Problem, config: PlannerConfig, allowed, scores) -> None:
+        self.problem, self.config, self.scores = problem, config, scores
+        self.order = [n for n in problem.boxes if n in allowed]
+        if scores is not None:
+            self.order.sort(key=lambda n: -scores[n])
+        if config.search == "informed":
+            candidates = could_matter(problem)
+            self.order = [n for n in self.order if n in candidates]
+        self.index = {name: i for i, name in enumerate(problem.boxes)}
+        self.reason = ""
+        self.refused_late = False
+
+    def run(self, began: float) -> PlanResult:
+        problem, goal = self.problem, self.problem.goal
+        self.reason = self._hopeless()
+        found: list[Motion] = []
+        status = "infeasible"
+        if not self.reason:
+            self.reason = f"no plan of up to {self.config.max_actions} actions"
+            try:
+                found = self._levels()
+            except _Limit:
+                status, self.reason = "limit", f"node limit {self.config.node_limit} reached"
+        problem.seconds.total = time.process_time() - began
+        if not found:
+            return PlanResult(
+                goal=goal, status=status, reason=self.reason, final={},
+                ambiguous=problem.undecided or self.refused_late, counts=problem.counts,
+                seconds=problem.seconds,
+            )  # fmt: skip
+        best = min(found, key=self._rank)
+        sets = {frozenset(motion.order) for motion in found}
+        return PlanResult(
+            goal=goal,
+            status="solved",
+            actions=logic.actions(goal, best.order),
+            moved=best.order,
+            final=best.final,
+            cost=best.cost,
+            ambiguous=problem.undecided or self.refused_late or len(sets) > 1,
+            counts=problem.counts,
+            check_ok=True,
+            max_penetration=best.max_penetration,
+            phases=best.phases,
+            seconds=problem.seconds,
+        )
+
+    def _rank(self, motion: Motion):
+        return round(motion.cost / COST_TOLERANCE), [self.index[n] for n in motion.order]
+
+    def _hopeless(self) -> str:
+        """Why no sequence can work even if everything else were gone; empty if one might."""
+        problem, goal = self.problem, self.problem.goal
+        subject, reference = problem.boxes[goal.subject], problem.boxes[goal.reference]
+        if not problem.grasps[goal.subject]:
+            return f"{subject.name} cannot be grasped: too wide for the hand or out of reach"
+        others = frozenset(problem.boxes) - {subject.name, reference.name}
+        movable = bool(problem.grasps[reference.name]) and self.config.max_actions >= 4
+        if not movable and all(
+            problem.goal_pose(others, grasp, reference) is None
+            for grasp in problem.grasps[subject.name]
+        ):
+            return "the goal region is out of reach, off the table or too tight for the hand"
+        return ""
+
+    def _visit(self) -> None:
+        self.problem.counts.nodes += 1
+        if self.problem.counts.nodes > self.config.node_limit:
+            raise _Limit
+
+    def _levels(self) -> list[Motion]:
+        subject = self.problem.goal.subject
+        frontier: list[tuple[str, ...]] = [()]
+        for _ in range(self.config.max_actions // 2):
+            found, following = [], []
+            for prefix in frontier:
+                self._visit()
+                motion = self._finish(prefix)
+                if motion is not None:
+                    found.append(motion)
+                    if self.scores is not None:
+                        return found
+                for name in self.order:
+                    if name == subject or name in prefix:
+                        continue
+                    self._visit()
+                    if self.problem.pickable(name, frozenset(prefix)):
+                        self._visit()
+                        following.append((*prefix, name))
+            if found:
+                return found
+            frontier = following
+        return []
+
+    def _finish(self, prefix: tuple[str, ...]) -> Motion | None:
+        """Pick the subject now and place it at the goal: all bounds in turn."""
+        problem, goal = self.problem, self.problem.goal
+        gone = frozenset(prefix)
+        if not logic.goal_blockers(problem.scene, goal) <= gone:
+            return None
+        options = problem.pickable(goal.subject, gone)
+        if not options:
+            return None
+        self._visit()
+        order = (*prefix, goal.subject)
+        for grasp in options:
+            if goal.reference not in gone and (
+                problem.goal_pose(gone, grasp, problem.boxes[goal.reference]) is None
+            ):
+                continue
+            placements = problem.place_all(order, grasp)
+            if placements is None:
+                problem.undecided = True
+                continue
+            solved = problem.keyframes(order, placements)
+            if solved is not None:
+                motion = problem.paths(order, placements, *solved)
+                if motion is not None:
+                    return motion
+            self.refused_late = True
+        return None
+
+
+def could_matter(problem: Problem) -> frozenset[str]:
+    """Objects whose leaving can change a pose bound: those near the goal region, those in the
+    way of a needed pick, and, in turn, those in the way of taking these; and the reference."""
+    goal = problem.goal
+    subject, reference = problem.boxes[goal.subject], problem.boxes[goal.reference]
+    found = {reference.name, subject.name}
+    if problem.grasps[subject.name]:
+        x, y, angle, a, b = problem.goal_region(reference)
+        spread = max(
+            math.hypot(abs(part[0]) + part[1], part[2])
+            for grasp in problem.grasps[subject.name]
+            for part in grasp.parts
+        )
+        area = Box(
+            name="area",
+            size=(2 * (a + spread) + 0.02, 2 * (b + spread) + 0.02, 1.0),
+            position=(x, y, 0.5),
+            yaw=angle,
+            color=(0.0, 0.0, 0.0),
+        )
+        found |= {
+            box.name
+            for box in problem.scene.objects
+            if footprint_gap(area, box) <= 0 and obstacle(box)[2] > 0
+        }
+    while True:
+        more = set(found)
+        for name in found:
+            more |= problem.above[name].union(*problem.blockers[name])
+        if more == found:
+            return frozenset(found)
+        found = more

@@ -1,0 +1,196 @@
+"""Example scenes: the picture, and over it the outlines of the objects that matter."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import cv2
+import numpy as np
+
+from relevance.scene import Predicate, content_hash
+from relevance.store import Dataset, Sample
+
+Rows = Callable[..., list[dict[str, Any]]]
+
+RELEVANT, KEPT, LOST = "#12a150", "#e08a00", "#d92d20"
+"""Outlines: relevant; kept by the network though irrelevant; left out though relevant."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Example:
+    """One task with its picture."""
+
+    anchor: str
+    goal: str
+    scene_id: str
+    picture: str
+    """SVG."""
+    plan: str
+    """Actions in words; empty without a plan."""
+    status: str
+    scores: Sequence[tuple[str, str, bool, float | None]]
+    """Name, colour (#rrggbb), relevant, score (None: no prediction), of every object."""
+    note: str
+
+
+def anchor(row: Mapping[str, Any]) -> str:
+    """Name of a task on the page."""
+    task = [row[key] for key in ("scene_id", "predicate", "subject", "reference")]
+    return f"task-{content_hash(task)}"
+
+
+def choose_examples(rows: Rows, checkpoint_id: str | None, *, per_predicate: int) -> list[dict]:
+    """Test tasks to show: of each predicate some with a relevant query, and what `prune` missed."""
+    wanted = rows(
+        """
+        with tasks as (
+            select *, len(list_filter(moved, lambda name: name not in (subject, reference)))
+                as n_blockers
+            from plans where split = 'test' and holds
+        )
+        select * from (
+            select *, row_number() over (
+                partition by predicate order by least(n_blockers, 2) desc, md5(plan_id)) as nth
+            from tasks)
+        where nth <= ?
+        """,
+        per_predicate,
+    )
+    missed = rows(
+        """
+        select distinct p.* from plans p join evaluations e
+            using (scene_id, predicate, subject, reference)
+        where e.checkpoint_id = ? and e.guide = 'prune' and e.beta = 0
+            and e.solved_unguided and not e.solved_guided
+        order by md5(p.plan_id) limit 4
+        """,
+        checkpoint_id,
+    )
+    notes = {anchor(row): "Missed by prune: a relevant object was left out." for row in missed}
+    chosen = {anchor(row): row for row in (*wanted, *missed)}
+    predictions = rows(
+        """
+        select scene_id, predicate, subject, reference, query, score from predictions
+        where checkpoint_id = ? and scene_id in (select unnest(?::varchar[]))
+        """,
+        checkpoint_id,
+        [row["scene_id"] for row in chosen.values()],
+    )
+    scores: dict[str, dict[str, float]] = {}
+    for row in predictions:
+        scores.setdefault(anchor(row), {})[row["query"]] = row["score"]
+    order = list(Predicate)
+    for key, row in chosen.items():
+        row |= {"anchor": key, "note": notes.get(key, ""), "scores": scores.get(key, {})}
+    return sorted(chosen.values(), key=lambda r: (bool(r["note"]), order.index(r["predicate"])))
+
+
+def draw_examples(dataset: Dataset, chosen: Sequence[dict[str, Any]]) -> list[Example]:
+    """Read the scenes of the chosen tasks and outline what matters in each."""
+    shards = sorted({row["shard"] for row in chosen})
+    wanted = {row["scene_id"] for row in chosen}
+    samples = {
+        sample.key: sample
+        for sample in (dataset.samples("test", shards) if shards else ())
+        if sample.key in wanted
+    }
+    return [_example(samples[row["scene_id"]], row) for row in chosen]
+
+
+def _example(sample: Sample, row: dict[str, Any]) -> Example:
+    scores, moved = row["scores"], set(row["moved"])
+    words = [
+        f"{action[0]} {action[1]}" + (f" on {action[2]}" if len(action) > 2 else "")
+        for action in row["actions"]
+    ]
+    return Example(
+        anchor=row["anchor"],
+        goal=f"{row['predicate']}({row['subject']}, {row['reference']})",
+        scene_id=row["scene_id"],
+        picture=outlined(
+            sample,
+            relevant=moved,
+            subject=row["subject"],
+            reference=row["reference"],
+            scores=scores,
+        ),
+        plan=" → ".join(words),
+        status=row["status"],
+        scores=[
+            (box.name, _hex(box.color), box.name in moved, scores.get(box.name))
+            for box in sample.scene.objects
+        ],
+        note=row["note"],
+    )
+
+
+def outlined(
+    sample: Sample,
+    *,
+    relevant: set[str],
+    subject: str,
+    reference: str,
+    scores: Mapping[str, float] | None = None,
+    beta: float = 0.0,
+) -> str:
+    """A scene as SVG: relevant objects outlined, goal objects tagged S and R.
+
+    With scores, queries that the network judges wrongly get a dashed outline.
+    """
+    height, width = sample.mask.shape
+    done, png = cv2.imencode(".png", cv2.cvtColor(sample.image, cv2.COLOR_RGB2BGR))
+    assert done, "the PNG encoder takes any uint8 image"
+    picture = base64.b64encode(png.tobytes()).decode()
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img" '
+        f'aria-label="{escape(f"{subject}, {reference}")}">',
+        f'<image href="data:image/png;base64,{picture}" width="{width}" height="{height}"/>',
+    ]
+    tags = []
+    for number, box in enumerate(sample.scene.objects, 1):
+        mask = (sample.mask == number).astype(np.uint8)
+        goal_object = box.name in (subject, reference)
+        kept = goal_object or not scores or scores.get(box.name, 0.0) > -beta
+        color = None
+        if box.name in relevant:
+            color = RELEVANT if kept else LOST
+        elif scores and kept and not goal_object:
+            color = KEPT
+        if color:
+            dashes = "" if color == RELEVANT else ' stroke-dasharray="4 2.5"'
+            path = _path(mask)
+            parts.append(
+                f'<path d="{path}" fill="none" stroke="#fff" stroke-width="4" '
+                'stroke-linejoin="round" opacity="0.9"/>'
+                f'<path d="{path}" fill="none" stroke="{color}" stroke-width="2" '
+                f'stroke-linejoin="round"{dashes}><title>{escape(box.name)}</title></path>'
+            )
+        if goal_object:
+            ys, xs = np.nonzero(mask)
+            x, y = float(xs.mean()), float(ys.mean())
+            letter = "S" if box.name == subject else "R"
+            tags.append(
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7" fill="#fff" stroke="#22282f"/>'
+                f'<text x="{x:.1f}" y="{y + 3.4:.1f}" text-anchor="middle" font-size="9.5" '
+                f'font-weight="700" font-family="system-ui, sans-serif" fill="#22282f">{letter}'
+                f"<title>{escape(box.name)}</title></text>"
+            )
+    return "".join([*parts, *tags, "</svg>"])
+
+
+def _path(mask: np.ndarray) -> str:
+    """SVG path of a mask's outlines; pixel centres lie half a pixel in."""
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_TC89_L1)
+    parts = []
+    for contour in contours:
+        points = " ".join(f"{x + 0.5:g},{y + 0.5:g}" for x, y in contour[:, 0])
+        parts.append(f"M{points}Z")
+    return "".join(parts)
+
+
+def _hex(color: Sequence[float]) -> str:
+    return "#" + "".join(f"{round(255 * value):02x}" for value in color)

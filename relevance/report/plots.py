@@ -1,0 +1,365 @@
+"""The report's plots as inline SVG, all in one quiet style.
+
+Text stays text and takes the page's font; ids start with the plot's name, so that many plots
+can share a page. A family has one colour everywhere, and so has a guide.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
+
+from relevance.report.figures import Comparison, Predictions, guided_cost, mean_interval
+from relevance.scene import Predicate
+
+PAPER_ACCURACY = {"same-plane": (0.90, 0.95, 0.94), "on": (0.76, 0.89, 0.87)}
+"""True relevant, true irrelevant and total of the paper's network."""
+PAPER_RELEVANT = {"same-plane": 0.14, "on": 0.30}
+"""Share of relevant queries in the paper's datasets."""
+PAPER_SECONDS = (3.1, 4.7)
+"""Range of the paper's mean planning times a task, s."""
+GROUPS = ("same-plane", "on")
+PREDICATES = tuple(predicate.value for predicate in Predicate)
+
+DASH, TIMES = "\u2013", "\u00d7"
+INK, MUTED, FAINT = "#22282f", "#6b7480", "#d9dde2"
+GROUP_COLOR = {"same-plane": "#2f6db3", "on": "#c26a1c"}
+GUIDE_COLOR = {
+    "unguided": "#8a939d",
+    "prune": "#c26a1c",
+    "prune-then-full": "#2f6db3",
+    "expand": "#3a8a5f",
+    "order": "#7a5aa6",
+}
+SHARES = (
+    ("true relevant", "true_relevant", "#3a8a5f"),
+    ("true irrelevant", "true_irrelevant", "#8a939d"),
+    ("total", "total", "#22282f"),
+)
+_STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "svg.fonttype": "none",
+    "text.color": INK,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": MUTED,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.titlecolor": INK,
+    "grid.color": "#eceff2",
+    "grid.linewidth": 0.8,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.major.size": 0,
+    "ytick.major.size": 0,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.8,
+    "lines.solid_capstyle": "round",
+}
+
+
+def svg(
+    name: str,
+    draw: Callable[..., None],
+    *,
+    size: tuple[float, float] = (6.4, 2.9),
+    panels: int = 1,
+    **given: Any,
+) -> str:
+    """Draw into `panels` axes side by side; inline SVG whose ids start with `name`.
+
+    `size` in inches; `given` goes to `draw` after the axes.
+    """
+    with mpl.rc_context({**_STYLE, "svg.hashsalt": name}):
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasSVG(figure)
+        draw(*figure.subplots(1, panels, squeeze=False)[0], **given)
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    text = re.sub(r'((?:xlink:)?href="#|url\(#)', rf"\g<1>{name}-", text)
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = text.replace("'DejaVu Sans'", "var(--font)")
+    return re.sub(r'<svg[^>]*?(viewBox="[^"]*")[^>]*>', r'<svg \1 role="img">', text, count=1)
+
+
+def _percent_axis(axis: Any, decimals: int = 0) -> None:
+    axis.set_major_formatter(PercentFormatter(1.0, decimals=decimals))
+
+
+def seconds(value: float) -> str:
+    """Seconds in the unit that reads best."""
+    if not math.isfinite(value):
+        return DASH
+    if value >= 100:
+        return f"{value:.0f} s"
+    if value >= 1:
+        return f"{value:.2g} s" if value >= 10 else f"{value:.1f} s"
+    return f"{1000 * value:.0f} ms" if value >= 0.01 else f"{1000 * value:.1f} ms"
+
+
+def label_shares(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    groups = [row["predicate"] for row in rows]
+    y = np.arange(len(rows))[::-1]
+    shares = [row["relevant_share"] or 0.0 for row in rows]
+    colors = [GROUP_COLOR[Predicate(group).family] for group in groups]
+    ax.barh(y, shares, height=0.56, color=colors)
+    for at, row, share in zip(y, rows, shares, strict=True):
+        ax.text(
+            share + 0.005,
+            at,
+            f"{100 * share:.1f}%  n = {row['queries']}",
+            va="center",
+            fontsize=8.5,
+        )
+        paper = PAPER_RELEVANT[Predicate(row["predicate"]).family]
+        ax.plot([paper, paper], [at - 0.36, at + 0.36], color=INK, linewidth=1.4)
+    ax.plot([], [], color=INK, linewidth=1.4, label="paper")
+    ax.legend(loc="lower right")
+    ax.set_yticks(y, groups)
+    ax.set_xlim(0, max([*shares, 0.3]) * 1.35)
+    ax.grid(axis="y", visible=False)
+    ax.set_xlabel("relevant among queries")
+    _percent_axis(ax.xaxis)
+
+
+def lengths(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    lengths = sorted({row["n_actions"] for row in rows})
+    width = 0.8 / len(GROUPS)
+    for number, group in enumerate(GROUPS):
+        counts = Counter()
+        for row in rows:
+            if Predicate(row["predicate"]).family == group:
+                counts[row["n_actions"]] += row["plans"]
+        total = sum(counts.values())
+        if total:
+            at = np.arange(len(lengths)) + (number - 0.5) * width
+            shares = [counts[length] / total for length in lengths]
+            label = f"{group} (n = {total})"
+            ax.bar(at, shares, width * 0.92, color=GROUP_COLOR[group], label=label)
+    ax.set_xticks(range(len(lengths)), [str(length) for length in lengths])
+    ax.set_xlabel("actions in the plan")
+    ax.set_ylabel("share of solved tasks")
+    ax.grid(axis="x", visible=False)
+    ax.legend()
+    _percent_axis(ax.yaxis)
+
+
+def reasons(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    y = np.arange(len(rows))[::-1]
+    counts = [row["goals"] for row in rows]
+    ax.barh(y, counts, height=0.56, color="#9aa4af")
+    for at, count in zip(y, counts, strict=True):
+        ax.text(count + max(counts) * 0.01, at, str(count), va="center", fontsize=8.5)
+    ax.set_yticks(y, [row["label"] for row in rows])
+    ax.set_xlim(0, max(counts) * 1.12)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.grid(axis="y", visible=False)
+    ax.set_xlabel("tasks")
+
+
+def times(ax: Axes, times: dict[str, np.ndarray]) -> None:
+    ax.axvspan(*PAPER_SECONDS, color="#f0e4d4", zorder=0)
+    ax.text(PAPER_SECONDS[1] * 1.1, 0.04, "paper, means", color=MUTED, fontsize=8.5)
+    for group, values in times.items():
+        values = np.sort(values)
+        label = f"{group}: median {seconds(float(np.median(values)))} (n = {len(values)})"
+        share = np.arange(1, len(values) + 1) / len(values)
+        ax.plot(values, share, color=GROUP_COLOR[group], drawstyle="steps-post", label=label)
+    ax.set_xscale("log")
+    ax.set_xlim(right=max(20.0, *(float(v.max()) for v in times.values())))
+    ax.set_xlabel("planning time of a task")
+    ax.set_ylabel("share of tasks done")
+    ax.legend(loc="lower right", bbox_to_anchor=(1, 0.1))
+    _percent_axis(ax.yaxis)
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: seconds(value)))
+
+
+def accuracy(ax: Axes, predictions: Predictions) -> None:
+    groups = [p for p in PREDICATES if len(predictions.of(p))]
+    for number, (label, attribute, color) in enumerate(SHARES):
+        for row, group in enumerate(groups):
+            y = len(groups) - 1 - row + (1 - number) * 0.22
+            value = getattr(predictions.of(group).accuracy(), attribute)
+            paper = PAPER_ACCURACY[Predicate(group).family][number]
+            ax.plot([paper, value], [y, y], color=FAINT, linewidth=1.2, zorder=1)
+            ax.plot(value, y, "o", color=color, markersize=6, label=label if not row else None)
+            ax.plot(paper, y, "|", color=color, markersize=9, markeredgewidth=1.6)
+    for row, group in enumerate(groups):
+        base = predictions.of(group).accuracy().base_rate
+        y = len(groups) - 1 - row
+        label = None if row else "always irrelevant (base rate of the total)"
+        ax.plot([base, base], [y - 0.4, y + 0.4], ":", color=INK, linewidth=1.2, label=label)
+    ax.plot([], [], "|", color=MUTED, markersize=9, markeredgewidth=1.6, label="paper")
+    ax.set_yticks(range(len(groups) - 1, -1, -1), groups)
+    ax.grid(axis="y", visible=False)
+    ax.set_xlabel("queries judged rightly")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.45, -0.16), ncols=5, columnspacing=1.2)
+    _percent_axis(ax.xaxis)
+
+
+def beta_accuracy(*axes: Axes, predictions: Predictions) -> None:
+    for ax, group in zip(axes, GROUPS, strict=True):
+        part = predictions.of(group)
+        ax.set_title(f"{group} (n = {len(np.unique(part.task))} tasks)")
+        ax.set_xlabel("beta (larger keeps more)")
+        if len(part):
+            limit = float(np.clip(np.ceil(np.abs(part.score).max()), 2, 12))
+            betas = np.linspace(-limit, limit, 97)
+            found = [part.accuracy(float(beta)) for beta in betas]
+            for label, attribute, color in SHARES:
+                ax.plot(betas, [getattr(a, attribute) for a in found], color=color, label=label)
+            whole = [a.tasks_whole for a in found]
+            ax.plot(betas, whole, "--", color="#7a5aa6", linewidth=1.4, label="whole tasks kept")
+        ax.axvline(0, color=FAINT, linewidth=1)
+        ax.set_ylim(0, 1.02)
+        _percent_axis(ax.yaxis)
+    axes[0].legend(loc="lower left")
+
+
+def scores(*axes: Axes, predictions: Predictions) -> None:
+    for ax, group in zip(axes, GROUPS, strict=True):
+        part = predictions.of(group)
+        ax.set_title(group)
+        ax.set_xlabel("score (logit)")
+        if len(part):
+            low, high = np.clip([part.score.min(), part.score.max()], -15, 15)
+            bins = np.linspace(low - 1e-6, high + 1e-6, 41).tolist()
+            for value, name, color in ((False, "irrelevant", "#9aa4af"), (True, "relevant", INK)):
+                scores = np.clip(part.score[part.relevant == value], low, high)
+                if len(scores):
+                    label = f"{name} (n = {len(scores)})"
+                    weights = np.full(len(scores), 1 / len(scores))
+                    ax.hist(scores, bins, weights=weights, color=color, alpha=0.65, label=label)
+            ax.legend(loc="upper right")
+        ax.axvline(0, color=MUTED, linewidth=1, linestyle=":")
+        ax.grid(axis="x", visible=False)
+        _percent_axis(ax.yaxis)
+    axes[0].set_ylabel("share of its class")
+
+
+def runtimes(*axes: Axes, comparisons: dict[str, list[Comparison]]) -> None:
+    """Mean CPU time, and NLPs, a task: unguided beside each guide, one group of bars a family."""
+    time_ax, nlp_ax = axes
+    ticks = []
+    for at, (group, found) in enumerate(comparisons.items()):
+        first = found[0]
+        bars = [("unguided", first.unguided, first.nlps_unguided)]
+        bars += [(c.guide, c.guided, c.nlps_guided) for c in found]
+        width = 0.8 / len(bars)
+        for number, (name, interval, nlps) in enumerate(bars):
+            x = at + (number - (len(bars) - 1) / 2) * width
+            style = {"width": width * 0.9, "color": GUIDE_COLOR[name]}
+            time_ax.bar(x, interval.value, label=None if at else name, **style)
+            spread = [[interval.value - interval.low], [interval.high - interval.value]]
+            time_ax.errorbar(x, interval.value, spread, color=INK, linewidth=1, capsize=2.5)
+            nlp_ax.bar(x, nlps, **style)
+        ticks.append(f"{group}\nn = {first.n_solvable}")
+    for ax, label in ((time_ax, "CPU time a task"), (nlp_ax, "NLPs solved a task")):
+        ax.set_xticks(range(len(ticks)), ticks)
+        ax.set_title(label)
+        ax.grid(axis="x", visible=False)
+    time_ax.legend()
+    time_ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: seconds(value)))
+
+
+def by_objects(ax: Axes, rows: dict[str, list[dict[str, Any]]]) -> None:
+    """Mean CPU time by the number of objects, with intervals; `rows` per guide, solvable tasks."""
+    first = next(iter(rows.values()))
+    series = {"unguided": (first, lambda row: row["seconds_unguided"])}
+    series |= {guide: (chosen, guided_cost) for guide, chosen in rows.items()}
+    for name, (chosen, cost) in series.items():
+        counts = sorted({row["n_objects"] for row in chosen})
+        means = [mean_interval(cost(r) for r in chosen if r["n_objects"] == n) for n in counts]
+        color = GUIDE_COLOR[name]
+        ax.plot(counts, [m.value for m in means], "o-", markersize=4, color=color, label=name)
+        lows, highs = [m.low for m in means], [m.high for m in means]
+        ax.fill_between(counts, lows, highs, color=color, alpha=0.15, linewidth=0)
+    ax.set_yscale("log")
+    ax.set_xlabel("objects in the scene")
+    ax.set_ylabel("mean CPU time a task")
+    ax.legend()
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: seconds(value)))
+
+
+def pairs(ax: Axes, rows: dict[str, list[dict[str, Any]]]) -> None:
+    ends = [
+        row[c] for r in rows.values() for row in r for c in ("seconds_unguided", "seconds_guided")
+    ]
+    low, high = min(ends) / 1.4, max(ends) * 1.4
+    ax.plot([low, high], [low, high], color=FAINT, linewidth=1.2)
+    ax.text(low * 1.15, low * 1.25, "same time", color=MUTED, fontsize=8, rotation=45)
+    for name, chosen in rows.items():
+        solved = [row for row in chosen if row["solved_guided"]]
+        missed = [row for row in chosen if not row["solved_guided"]]
+        for part, marker, label in ((solved, "o", name), (missed, "x", f"{name}: missed")):
+            if part:
+                x = [row["seconds_unguided"] for row in part]
+                y = [row["seconds_guided"] for row in part]
+                ax.scatter(
+                    x, y, s=16, marker=marker, color=GUIDE_COLOR[name], alpha=0.7, label=label
+                )
+    for axis, set_scale in ((ax.xaxis, ax.set_xscale), (ax.yaxis, ax.set_yscale)):
+        set_scale("log")
+        axis.set_major_formatter(FuncFormatter(lambda value, _: seconds(value)))
+    ax.set_xlim(low, high)
+    ax.set_ylim(low, high)
+    ax.set_xlabel("CPU time unguided")
+    ax.set_ylabel("CPU time guided")
+    ax.legend(loc="upper left")
+
+
+def beta_reruns(*axes: Axes, sweep: dict[str, list[Comparison]]) -> None:
+    time_ax, miss_ax = axes
+    for group, found in sweep.items():
+        betas, color = [c.beta for c in found], GROUP_COLOR[group]
+        label = f"{group} (n = {found[0].n_solvable})"
+        speedups = [c.speedup_both for c in found]
+        time_ax.plot(
+            betas, [s.value for s in speedups], "o-", markersize=4, color=color, label=label
+        )
+        lows, highs = [s.low for s in speedups], [s.high for s in speedups]
+        time_ax.fill_between(betas, lows, highs, color=color, alpha=0.15, linewidth=0)
+        shares = [c.misses / c.n_solvable if c.n_solvable else np.nan for c in found]
+        miss_ax.plot(betas, shares, "o-", markersize=4, color=color)
+    time_ax.axhline(1, color=FAINT, linewidth=1.2)
+    time_ax.set_title("speed-up, misses left out")
+    time_ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}{TIMES}"))
+    time_ax.legend()
+    miss_ax.set_title("tasks missed")
+    miss_ax.set_ylim(bottom=0)
+    _percent_axis(miss_ax.yaxis)
+    for ax in axes:
+        ax.set_xlabel("beta (larger keeps more)")
+
+
+def training_curve(ax: Axes, history: Sequence[Mapping[str, float]]) -> None:
+    """Training loss and its parts by step."""
+    colors = {"loss": INK, "relevance": "#2f6db3", "mask": "#c26a1c", "geometry": "#3a8a5f"}
+    names = [name for name in history[0] if name != "step"]
+    for name in names:
+        steps, values = [h["step"] for h in history], [h[name] for h in history]
+        ax.plot(steps, values, color=colors.get(name, MUTED), linewidth=1.5, label=name)
+    ax.set_yscale("log")
+    ax.set_xlabel("step")
+    ax.set_ylabel("training loss")
+    ax.legend(ncols=2)

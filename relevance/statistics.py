@@ -1,0 +1,396 @@
+"""What a dataset holds and whether it keeps its contracts.
+
+`check` reads every byte: hashes and schemas of all files, the rules of `schemas/checks.sql`
+between rows, and what SQL cannot say (a scene is possible and is what its id says, a plan's
+last poses fulfil its goal, a stored scene renders again to equal pixels).
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import tarfile
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from relevance.generation import ShardSpec, load_config, shards_of
+from relevance.labels import stored_scene
+from relevance.scene import (
+    Goal,
+    Pose,
+    Predicate,
+    Scene,
+    SceneError,
+    goal_holds,
+    scene_from_json,
+)
+from relevance.simulation import Renderer
+from relevance.store import MEMBERS, SCHEMAS, TABLES, Dataset, DatasetError
+
+PER_RULE = 20
+"""Breaches of one rule that are listed; the rest is counted."""
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Breach:
+    """One broken contract."""
+
+    file: str
+    """Within the dataset."""
+    row: int | None = None
+    """From 0; None when it is about the whole file."""
+    column: str | None = None
+    message: str
+
+    def __str__(self) -> str:
+        row = None if self.row is None else f"row {self.row}"
+        column = None if self.column is None else f"column {self.column}"
+        return ": ".join(part for part in (self.file, row, column, self.message) if part)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """A small table to print: one view of the dataset."""
+
+    name: str
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Statistics:
+    """How much a dataset holds, and its tables."""
+
+    path: str
+    scenes: int
+    goals: int
+    plans: int
+    """Goals with a plan that holds."""
+    queries: int
+    relevant: int
+    shards: tuple[int, int]
+    """Finished shards of scenes, and all of them."""
+    labelled: tuple[int, int]
+    """Finished shards of labels (one a predicate), and all of them."""
+    tables: tuple[Table, ...]
+
+    def __getitem__(self, name: str) -> Table:
+        """The table made from the view `name`."""
+        return next(table for table in self.tables if table.name == name)
+
+
+VIEWS = {
+    "paper_label_distribution": "Label distribution (the paper's table)",
+    "label_balance": "Label balance of the queries",
+    "plan_lengths": "Plan lengths",
+    "plan_failures": "Goals without a plan, by reason",
+    "plan_verdicts": "Do the plans hold?",
+    "plan_seconds": "Planning time, s",
+    "visibility": "Visibility of the objects",
+    "scene_sizes": "Scenes by number of boxes",
+}
+"""The views that `statistics` shows, with their titles."""
+
+
+def statistics(root: str | Path) -> Statistics:
+    """Count and tabulate a dataset through its DuckDB views."""
+    dataset = Dataset.open(root)
+    specs = shards_of(dataset)
+    with dataset.connect() as connection:
+        tables = []
+        for view, title in VIEWS.items():
+            found = connection.execute(f"FROM {view}")
+            columns = tuple(column[0] for column in found.description or ())
+            rows = tuple(tuple(row) for row in found.fetchall())
+            tables.append(Table(name=view, title=title, columns=columns, rows=rows))
+        totals = connection.execute(
+            "SELECT (SELECT count(*) FROM scenes), (SELECT count(*) FROM plans),"
+            " (SELECT count(*) FROM plans WHERE holds),"
+            " (SELECT count(*) FROM labels WHERE NOT is_goal_object),"
+            " (SELECT count(*) FROM labels WHERE NOT is_goal_object AND relevant)"
+        ).fetchone()
+    assert totals is not None, "a query of counts has one row"
+    scenes, goals, plans, queries, relevant = totals
+    return Statistics(
+        path=str(root),
+        scenes=scenes,
+        goals=goals,
+        plans=plans,
+        queries=queries,
+        relevant=relevant,
+        shards=(len(dataset.files("scenes")), len(specs)),
+        labelled=(len(dataset.files("labels")), sum(len(spec.predicates) for spec in specs)),
+        tables=tuple(tables),
+    )
+
+
+def card(found: Statistics) -> str:
+    """A dataset card in Markdown."""
+    share = f"{found.relevant / found.queries:.1%}" if found.queries else "none"
+    lines = [
+        f"# Dataset {Path(found.path).name}",
+        "",
+        f"{found.scenes} scenes, {found.goals} goals, {found.plans} plans that hold, "
+        f"{found.queries} queries ({share} relevant); "
+        f"{found.shards[0]} of {found.shards[1]} shards made, "
+        f"{found.labelled[0]} of {found.labelled[1]} labelled.",
+    ]
+    for table in found.tables:
+        lines += [
+            "",
+            f"## {table.title}",
+            "",
+            _bar(table.columns),
+            _bar("---" for _ in table.columns),
+        ]
+        lines += [_bar(cell(value) for value in row) for row in table.rows]
+    return "\n".join(lines) + "\n"
+
+
+def cell(value: Any) -> str:
+    """A value as a table shows it: three significant digits, a dash for null."""
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _bar(cells: Iterable[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+# contracts ------------------------------------------------------------------------------------
+
+
+def check(
+    root: str | Path, *, render: bool = True, progress: Progress | None = None
+) -> list[Breach]:
+    """Every contract of a dataset; an empty list when it keeps them all.
+
+    `render` renders one scene of each shard again and compares pixels. Raises DatasetError only
+    when there is no dataset at all.
+    """
+    dataset = Dataset.open(root)
+    breaches = list(_description(dataset))
+    files = [file for table in TABLES for file in dataset.files(table)]
+    broken: set[Path] = set()
+    for done, file in enumerate(files, 1):
+        found = list(_file(dataset, file))
+        breaches += found
+        if found:
+            broken.add(file)
+        if progress:
+            progress(done, len(files))
+    # A broken file would make every row that refers to it look wrong: leave its shard out.
+    left_out = {file for file in files for bad in broken if _same_shard(dataset, file, bad)}
+    breaches += _rules(dataset, left_out)
+    whole = [file for file in dataset.files("scenes") if file not in left_out]
+    breaches += _scenes(dataset, whole, render)
+    breaches += _goals(dataset, left_out)
+    return breaches
+
+
+def _description(dataset: Dataset) -> Iterator[Breach]:
+    specs: list[ShardSpec] = []
+    try:
+        load_config(dataset)
+        specs = shards_of(dataset)
+    except DatasetError as error:
+        yield Breach(file="dataset.json", message=_message(dataset, error))
+    listed = {(spec.split, spec.shard) for spec in specs}
+    for table in ("scenes", "plans", "timings", "labels"):
+        for file in dataset.files(table):
+            keys = dataset.file_keys(file)
+            if specs and (keys.get("split"), keys.get("shard")) not in listed:
+                yield Breach(
+                    file=_name(dataset, file),
+                    message="expected a shard that dataset.json lists, found none such",
+                )
+
+
+def _file(dataset: Dataset, file: Path) -> Iterator[Breach]:
+    """What one Parquet file shows by itself: readable, unchanged, right schema, right settings."""
+    name = _name(dataset, file)
+    try:
+        body = dataset.read_file(file)
+    except DatasetError as error:
+        text = _message(dataset, error)
+        column = re.match(r"column (\w+): ", text)
+        yield Breach(
+            file=name,
+            column=column[1] if column else None,
+            message=text[column.end() :] if column else text,
+        )
+        return
+    table = name.split("/")[0]
+    description = dataset.description
+    expected = {
+        "scenes": {"config_hash": description.get("hashes", {}).get("scenes")},
+        "plans": {
+            "config_hash": description.get("hashes", {}).get("plans"),
+            "planner_version": description.get("planner_version"),
+        },
+    }
+    for column, value in {**expected.get(table, {})}.items():
+        for row, found in enumerate(body[column].to_pylist()):
+            if value is not None and found != value:
+                yield Breach(
+                    file=name,
+                    row=row,
+                    column=column,
+                    message=f"expected {value} as in dataset.json, found {found}",
+                )
+                break
+    if table == "scenes":
+        try:
+            tar = dataset.read_images(**_where(dataset, file))
+        except DatasetError as error:
+            text = str(error)
+            images = dataset.images_path(**_where(dataset, file))
+            mine = text.startswith(str(images))
+            yield Breach(
+                file=_name(dataset, images if mine else file),
+                message=_message(dataset, error),
+            )
+            return
+        ids = body["scene_id"].to_pylist()
+        with tarfile.open(fileobj=io.BytesIO(tar)) as archive:
+            members = archive.getnames()
+        wanted = [f"{key}.{member}" for key in ids for member in MEMBERS]
+        if members != wanted:
+            odd = next(iter({*wanted} ^ {*members}), "another order")
+            yield Breach(
+                file=_name(dataset, dataset.images_path(**_where(dataset, file))),
+                message=f"expected the {len(wanted)} members of {len(ids)} scenes, "
+                f"found {len(members)} ({odd})",
+            )
+
+
+def _rules(dataset: Dataset, left_out: set[Path]) -> Iterator[Breach]:
+    """The breaches of every rule of `schemas/checks.sql`."""
+    partial = any(file.relative_to(dataset.path).parts[0] == "scenes" for file in left_out)
+    with dataset.connect(origin=True, without=left_out) as connection:
+        for rule, query in rules().items():
+            if partial and rule.startswith("predictions"):
+                continue  # their scenes may be among those left out
+            found = connection.execute(f"FROM ({query}) ORDER BY ALL").fetchall()
+            for file, row, column, message in found[:PER_RULE]:
+                yield Breach(file=file, row=row, column=column, message=message)
+            if len(found) > PER_RULE:
+                more = len(found) - PER_RULE
+                yield Breach(file=found[PER_RULE][0], message=f"and {more} more rows: {rule}")
+
+
+def rules() -> dict[str, str]:
+    """The rules between rows, by name, as queries (file, row, column, message)."""
+    parts = re.split(r"^-- rule: (.*)$", (SCHEMAS / "checks.sql").read_text(), flags=re.MULTILINE)
+    return {
+        name: query.strip().rstrip(";")
+        for name, query in zip(parts[1::2], parts[2::2], strict=True)
+    }
+
+
+def _scenes(dataset: Dataset, files: list[Path], render: bool) -> Iterator[Breach]:
+    """Every scene is possible and what its id says; one a shard renders to equal pixels."""
+    for file in files:
+        name = _name(dataset, file)
+        scenes: list[Scene] = []
+        for row, values in enumerate(dataset.read_file(file).to_pylist()):
+            try:
+                scene = stored_scene(values, where="")
+            except SceneError as error:
+                yield Breach(file=name, row=row, column="objects", message=str(error))
+                continue
+            if scene.id != values["scene_id"]:
+                yield Breach(
+                    file=name,
+                    row=row,
+                    column="scene_id",
+                    message=f"expected {scene.id}, the hash of the row, found {values['scene_id']}",
+                )
+            scenes.append(scene)
+        where = _where(dataset, file)
+        images = _name(dataset, dataset.images_path(**where))
+        with tarfile.open(fileobj=io.BytesIO(dataset.read_images(**where))) as archive:
+            for scene in scenes:
+                member = archive.extractfile(f"{scene.id}.scene.json")
+                if member is None or scene_from_json(member.read()) != scene:
+                    yield Breach(
+                        file=images, message=f"{scene.id}.scene.json: expected the scene of its row"
+                    )
+        if render and scenes:
+            yield from _pixels(dataset, where, images)
+
+
+def _pixels(dataset: Dataset, where: dict[str, Any], images: str) -> Iterator[Breach]:
+    sample = next(dataset.samples(where["split"], [where["shard"]]))
+    with Renderer() as renderer:
+        again = renderer.render(sample.scene)
+    for member in ("image", "mask", "views"):
+        stored, rendered = getattr(sample, member), getattr(again, member)
+        if not np.array_equal(stored, rendered):
+            yield Breach(
+                file=images,
+                message=f"{sample.key}: {member}: expected equal pixels when rendered again, "
+                "found others",
+            )
+
+
+def _goals(dataset: Dataset, left_out: set[Path]) -> Iterator[Breach]:
+    """The last poses of every plan that holds fulfil its goal."""
+    for file in dataset.files("plans"):
+        keys = dataset.file_keys(file)
+        scenes_file = dataset.shard_path("scenes", split=keys["split"], shard=keys["shard"])
+        if file in left_out or not scenes_file.is_file():
+            continue
+        scenes = {row["scene_id"]: row for row in dataset.read_file(scenes_file).to_pylist()}
+        for row, plan in enumerate(dataset.read_file(file).to_pylist()):
+            if not plan["holds"] or plan["scene_id"] not in scenes:
+                continue
+            goal = Goal(
+                predicate=Predicate(plan["predicate"]),
+                subject=plan["subject"],
+                reference=plan["reference"],
+            )
+            final = {
+                item["name"]: Pose(position=tuple(item["position"]), yaw=item["yaw"], on=item["on"])
+                for item in plan["final"]
+            }
+            try:
+                fulfilled = goal_holds(stored_scene(scenes[plan["scene_id"]]).moved(final), goal)
+            except SceneError:
+                continue  # reported with the scene
+            if not fulfilled:
+                yield Breach(
+                    file=_name(dataset, file),
+                    row=row,
+                    column="final",
+                    message=f"expected {goal} to be true of the last poses, found that it is not",
+                )
+
+
+def _same_shard(dataset: Dataset, a: Path, b: Path) -> bool:
+    if a == b:
+        return True
+    first, second = dataset.file_keys(a), dataset.file_keys(b)
+    return (first.get("split"), first.get("shard")) == (second.get("split"), second.get("shard"))
+
+
+def _where(dataset: Dataset, file: Path) -> dict[str, Any]:
+    keys = dataset.file_keys(file)
+    return {"split": keys["split"], "shard": keys["shard"]}
+
+
+def _name(dataset: Dataset, file: Path) -> str:
+    return str(file.relative_to(dataset.path))
+
+
+def _message(dataset: Dataset, error: DatasetError) -> str:
+    """The error without the file's name, which a Breach says by itself."""
+    return re.sub(rf"^{re.escape(str(dataset.path))}/?[^:]*: ", "", str(error))

@@ -1,0 +1,94 @@
+"""Images: what a sample of an image tar holds, encoded and decoded.
+
+Everything is lossless: a stored scene renders again to equal pixels, and a test says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from relevance.scene import Scene, scene_from_json
+from relevance.store.tables import DatasetError
+
+VIEW_SIZE = 32
+"""Edge of a canonical view, pixels."""
+MEMBERS = ("mask.png", "scene.json", "scene.webp", "views.webp")
+"""What every sample of an image tar holds, in this order."""
+
+
+class Pictures(Protocol):
+    """What `write_images` stores of a scene (a `Rendering` is one)."""
+
+    @property
+    def image(self) -> np.ndarray: ...
+    @property
+    def mask(self) -> np.ndarray: ...
+    @property
+    def views(self) -> np.ndarray: ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sample:
+    """One scene with its images, as stored."""
+
+    key: str
+    """The scene's id."""
+    scene: Scene
+    image: np.ndarray
+    """(H, W, 3) uint8, RGB."""
+    views: np.ndarray
+    """(N, 32, 32, 3) uint8, RGB, in the order of the scene's objects."""
+    mask: np.ndarray
+    """(H, W) uint8: 0 background and table, 1 + i object i."""
+
+
+def encode(pictures: Pictures, scene_json: str) -> dict[str, bytes]:
+    """The members of one sample by name, in order."""
+    views = np.concatenate(list(pictures.views), axis=1)
+    # WebP quality over 100 means lossless
+    lossless = [cv2.IMWRITE_WEBP_QUALITY, 101]
+    return {
+        "mask.png": _encoded(".png", pictures.mask, []),
+        "scene.json": scene_json.encode(),
+        "scene.webp": _encoded(".webp", cv2.cvtColor(pictures.image, cv2.COLOR_RGB2BGR), lossless),
+        "views.webp": _encoded(".webp", cv2.cvtColor(views, cv2.COLOR_RGB2BGR), lossless),
+    }
+
+
+def _encoded(extension: str, image: np.ndarray, options: list[int]) -> bytes:
+    done, content = cv2.imencode(extension, image, options)
+    assert done, f"{extension} of shape {image.shape} could not be encoded"
+    return content.tobytes()
+
+
+def decode(item: Mapping[str, Any]) -> Sample:
+    """A sample from its members, as webdataset groups them; DatasetError names a bad one."""
+    where = f"{item['__url__']}: {item['__key__']}"
+    for member in MEMBERS:
+        if member not in item:
+            raise DatasetError(f"{where}: expected member {member}, found none")
+
+    def image(member: str, flag: int) -> np.ndarray:
+        content = cv2.imdecode(np.frombuffer(item[member], np.uint8), flag)
+        if content is None:
+            raise DatasetError(f"{where}.{member}: expected an image, found undecodable bytes")
+        return content
+
+    scene = scene_from_json(item["scene.json"], where=f"{where}.scene.json")
+    wide = cv2.cvtColor(image("views.webp", cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    expected = (VIEW_SIZE, VIEW_SIZE * len(scene.objects), 3)
+    if wide.shape != expected:
+        raise DatasetError(f"{where}.views.webp: expected shape {expected}, found {wide.shape}")
+    views = np.stack(np.split(wide, len(scene.objects), axis=1))
+    return Sample(
+        key=item["__key__"],
+        scene=scene,
+        image=cv2.cvtColor(image("scene.webp", cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB),
+        views=views,
+        mask=image("mask.png", cv2.IMREAD_GRAYSCALE),
+    )

@@ -1,0 +1,155 @@
+-- Views over the tables of a dataset: scenes, plans, timings, labels, checkpoints, predictions,
+-- evaluations. Plain DuckDB SQL; `relevance sql` has all of them, and after tables.sql they work
+-- in any DuckDB. Shares are 0..1.
+
+-- One row an object of a scene; place counts from 0 and mask = place + 1.
+CREATE OR REPLACE VIEW objects AS
+SELECT
+    s.scene_id, s.split, s.shard, s.family, s.n_objects,
+    (p.place - 1)::INTEGER AS place,
+    o.name, o.size, o.position, o.yaw, o.color, o."on" AS stands_on,
+    o.visible_pixels, o.visible_fraction
+FROM scenes AS s, range(1, len(s.objects) + 1) AS p (place), LATERAL (SELECT s.objects[p.place] AS o);
+
+-- How the labels of the queries (goal objects left out) are balanced.
+CREATE OR REPLACE VIEW label_balance AS
+SELECT
+    predicate, split, policy,
+    count(DISTINCT plan_id) AS plans,
+    count(*) AS queries,
+    count(*) FILTER (relevant) AS relevant,
+    count(*) FILTER (relevant) / count(*) AS relevant_share,
+    count(*) FILTER (ambiguous) / count(*) AS ambiguous_share
+FROM labels
+WHERE NOT is_goal_object
+GROUP BY ALL
+ORDER BY ALL;
+
+-- The paper's table of label distribution: per predicate and split, over all plans
+-- (n_actions = 'all') and by length of the plan. predicate = 'same-plane' sums its four
+-- predicates. Goals without a plan have no length, so only 'all' counts them.
+CREATE OR REPLACE VIEW paper_label_distribution AS
+WITH queries AS (
+    SELECT plan_id, count(*) AS queries, count(*) FILTER (relevant) AS relevant
+    FROM labels
+    WHERE NOT is_goal_object
+    GROUP BY plan_id
+),
+goals AS (
+    SELECT
+        CASE p.predicate WHEN 'on' THEN 'on' ELSE 'same-plane' END AS family,
+        p.predicate, p.split,
+        CASE WHEN p.status = 'solved' THEN p.n_actions END AS n_actions,
+        p.status = 'solved' AS solved, p.holds,
+        coalesce(q.queries, 0) AS queries, coalesce(q.relevant, 0) AS relevant
+    FROM plans AS p LEFT JOIN queries AS q USING (plan_id)
+),
+grouped AS (
+    SELECT
+        CASE WHEN grouping(predicate) = 1 THEN family ELSE predicate END AS predicate,
+        grouping(predicate) AS is_family, family, split,
+        CASE WHEN grouping(n_actions) = 1 THEN 'all' ELSE n_actions::VARCHAR END AS n_actions,
+        count(*) AS goals, count(*) FILTER (solved) AS solved, count(*) FILTER (holds) AS plans,
+        sum(queries)::BIGINT AS queries, sum(relevant)::BIGINT AS relevant
+    FROM goals
+    GROUP BY GROUPING SETS (
+        (family, predicate, split, n_actions), (family, predicate, split),
+        (family, split, n_actions), (family, split)
+    )
+)
+SELECT
+    predicate, split, n_actions, goals, solved, plans, queries, relevant,
+    relevant / nullif(queries, 0) AS relevant_share
+FROM grouped
+WHERE n_actions IS NOT NULL AND (family <> 'on' OR is_family = 0)
+ORDER BY predicate, split, n_actions <> 'all', length(n_actions), n_actions;
+
+-- How long the plans are.
+CREATE OR REPLACE VIEW plan_lengths AS
+SELECT
+    predicate, split, n_actions,
+    count(*) AS plans,
+    count(*) / sum(count(*)) OVER (PARTITION BY predicate, split) AS share
+FROM plans
+WHERE holds
+GROUP BY predicate, split, n_actions
+ORDER BY ALL;
+
+-- Goals that made no labels, by reason; a solved plan that a check refuted stands here too.
+CREATE OR REPLACE VIEW plan_failures AS
+SELECT
+    predicate, split,
+    CASE
+        WHEN status <> 'solved' THEN status
+        WHEN NOT check_ok THEN 'refuted by the dense check'
+        ELSE 'refuted by the replay'
+    END AS status,
+    CASE
+        WHEN status <> 'solved' THEN reason
+        WHEN NOT check_ok THEN reason
+        ELSE replay_reason
+    END AS reason,
+    count(*) AS goals
+FROM plans
+WHERE NOT holds
+GROUP BY ALL
+ORDER BY predicate, split, goals DESC, status, reason;
+
+-- Does every plan hold, and how many were replayed in the simulator?
+CREATE OR REPLACE VIEW plan_verdicts AS
+SELECT
+    predicate, split,
+    count(*) AS goals,
+    count(*) FILTER (status = 'solved') AS solved,
+    count(*) FILTER (holds) AS plans,
+    count(*) FILTER (ambiguous AND holds) AS ambiguous,
+    count(*) FILTER (replay_ok IS NOT NULL) AS replayed,
+    count(*) FILTER (replay_ok) AS replay_ok,
+    max(max_penetration) FILTER (holds) AS max_penetration,
+    max(replay_max_penetration) FILTER (holds) AS replay_max_penetration
+FROM plans
+GROUP BY ALL
+ORDER BY ALL;
+
+-- Planning time in seconds, failures included.
+CREATE OR REPLACE VIEW plan_seconds AS
+SELECT
+    predicate, split,
+    count(*) AS goals,
+    sum(seconds) AS total,
+    avg(seconds) AS mean,
+    median(seconds) AS median,
+    quantile_cont(seconds, 0.9) AS p90,
+    max(seconds) AS longest
+FROM timings
+GROUP BY ALL
+ORDER BY ALL;
+
+-- How much of the objects the images show.
+CREATE OR REPLACE VIEW visibility AS
+SELECT
+    split, family,
+    count(DISTINCT scene_id) AS scenes,
+    count(*) AS objects,
+    avg(visible_fraction) AS mean,
+    min(visible_fraction) AS lowest,
+    count(*) FILTER (visible_fraction < 0.5) / count(*) AS share_under_half,
+    min(visible_pixels) AS fewest_pixels
+FROM objects
+GROUP BY ALL
+ORDER BY ALL;
+
+-- Scenes by number of boxes.
+CREATE OR REPLACE VIEW scene_sizes AS
+SELECT split, family, n_objects, count(*) AS scenes
+FROM scenes
+GROUP BY ALL
+ORDER BY ALL;
+
+-- Scenes that are in more than one split, or twice in one: must be empty.
+CREATE OR REPLACE VIEW split_overlap AS
+SELECT scene_id, list(DISTINCT split ORDER BY split) AS splits, count(*) AS scenes
+FROM scenes
+GROUP BY scene_id
+HAVING count(*) > 1
+ORDER BY scene_id;

@@ -1,0 +1,574 @@
+"""Schemas, Parquet files, image tars and DuckDB views, on small hand-made scenes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tarfile
+import time
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from relevance.scene import Box, Camera, Light, Robot, Scene, Table, scene_to_json
+from relevance.store import (
+    SCHEMAS,
+    SPLITS,
+    TABLES,
+    Dataset,
+    DatasetError,
+    differences,
+    replacing,
+    sql,
+    table_schema,
+    type_name,
+)
+
+
+@dataclass(frozen=True)
+class Pictures:
+    image: np.ndarray
+    mask: np.ndarray
+    views: np.ndarray
+
+
+def scene(x: float = 0.0) -> Scene:
+    return Scene(
+        objects=(
+            Box(name="red", size=(0.06, 0.06, 0.08), position=(x, 0.1, 0.04), color=(1, 0, 0)),
+            Box(
+                name="blue",
+                size=(0.05, 0.05, 0.05),
+                position=(x, 0.1, 0.105),
+                color=(0, 0, 1),
+                on="red",
+            ),
+            Box(name="green", size=(0.05, 0.05, 0.05), position=(x, -0.1, 0.025), color=(0, 1, 0)),
+        )
+    )
+
+
+def pictures(of: Scene) -> Pictures:
+    rng = np.random.default_rng(int(of.id[:8], 16))
+    n = len(of.objects)
+    return Pictures(
+        image=rng.integers(0, 256, (192, 320, 3), dtype=np.uint8),
+        mask=rng.integers(0, n + 1, (192, 320), dtype=np.uint8),
+        views=rng.integers(0, 256, (n, 32, 32, 3), dtype=np.uint8),
+    )
+
+
+def scene_values(of: Scene, index: int, split: str = "train", shard: int = 0) -> dict:
+    def plain(value: object) -> dict:
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}  # type: ignore[arg-type]
+
+    return {
+        "scene_id": of.id,
+        "split": split,
+        "shard": shard,
+        "family": "same-plane",
+        "seed": 0,
+        "index": index,
+        "attempt": 0,
+        "n_objects": len(of.objects),
+        "objects": [
+            {**plain(box), "visible_pixels": 90, "visible_fraction": 0.9} for box in of.objects
+        ],
+        "table_top": plain(of.table),
+        "camera": plain(of.camera),
+        "light": plain(of.light),
+        "robot": plain(of.robot),
+        "config_hash": "c",
+    }
+
+
+def _plain(value: object) -> object:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def label_values(of: Scene, query: str, relevant: bool, **more: object) -> dict:
+    return {
+        "plan_id": f"p{of.id}",
+        "scene_id": of.id,
+        "split": "train",
+        "shard": 0,
+        "predicate": "behind",
+        "subject": "red",
+        "reference": "green",
+        "query": query,
+        "relevant": relevant,
+        "is_goal_object": query != "blue",
+        "ambiguous": False,
+        "policy": "found",
+        "visible_fraction": 0.9,
+        "planner_version": "1",
+        "config_hash": "c",
+        **more,
+    }
+
+
+KEYS = {"split": "train", "shard": 0}
+LABELS = {**KEYS, "predicate": "behind"}
+
+
+def fill(dataset: Dataset, shard: int = 0, count: int = 4) -> list[Scene]:
+    scenes = [scene(0.01 * (count * shard + i)) for i in range(count)]
+    made = dataset.write_images(
+        "train", shard, ((s.id, pictures(s), scene_to_json(s)) for s in scenes)
+    )
+    rows = [scene_values(s, i, shard=shard) for i, s in enumerate(scenes)]
+    dataset.write_rows("scenes", rows, split="train", shard=shard, made_by=made)
+    return scenes
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    return Dataset.create(tmp_path / "it's [1]*", {"config": {"seed": 0}})
+
+
+# schemas ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_schema_files_are_complete(table: str) -> None:
+    raw = tomllib.loads((SCHEMAS / f"{table}.toml").read_text())
+    assert raw["table"] == table
+    assert isinstance(raw["version"], int)
+    assert raw["description"].endswith(".")
+    assert raw["path"].startswith(f"{table}/")
+    schema = table_schema(table)
+    assert schema.arrow.names == [column.name for column in schema.columns]
+    assert len(set(schema.arrow.names)) == len(schema.columns)
+    for column in schema.columns:
+        assert column.meaning.endswith("."), column.name
+        kind = schema.arrow.field(column.name).type
+        while pa.types.is_list(kind):
+            kind = kind.value_type
+        inner = [field.name for field in kind] if pa.types.is_struct(kind) else []
+        assert [field["name"] for field in column.fields] == inner, column.name
+        assert all(field["meaning"] for field in column.fields)
+
+
+def test_scene_schema_equals_the_domain_types() -> None:
+    arrow = table_schema("scenes").arrow
+    boxes = [field.name for field in arrow.field("objects").type.value_type]
+    names = [field.name for field in dataclasses.fields(Box)]  # type: ignore[arg-type]
+    assert boxes == [*names, "visible_pixels", "visible_fraction"]
+    for column, kind in (
+        ("table_top", Table),
+        ("camera", Camera),
+        ("light", Light),
+        ("robot", Robot),
+    ):
+        fields = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+        assert [field.name for field in arrow.field(column).type] == fields
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_type_names_survive_duckdb(table: str) -> None:
+    for column in table_schema(table).columns:
+        found = type_name(table_schema(table).arrow.field(column.name).type)
+        assert found == column.type.replace('"on"', "on")
+
+
+def test_unknown_table() -> None:
+    with pytest.raises(DatasetError, match=r"unknown table 'nope', expected one of scenes, plans"):
+        table_schema("nope")
+
+
+# the folder ------------------------------------------------------------------------------------
+
+
+def test_open_without_a_dataset(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"nowhere: no dataset.json there, expected a dataset f"):
+        Dataset.open(tmp_path / "nowhere")
+    (tmp_path / "dataset.json").write_text("{broken")
+    with pytest.raises(DatasetError, match=r"dataset.json: expected a JSON object"):
+        Dataset.open(tmp_path)
+
+
+def test_create_twice(tmp_path: Path) -> None:
+    Dataset.create(tmp_path, {"config": {"seed": 0, "planner": {"limit": 3}}})
+    before = (tmp_path / "dataset.json").read_bytes()
+    again = Dataset.create(tmp_path, {"config": {"planner": {"limit": 3}, "seed": 0}})
+    assert again.description == {"config": {"seed": 0, "planner": {"limit": 3}}}
+    assert (tmp_path / "dataset.json").read_bytes() == before
+    with pytest.raises(DatasetError, match=r"config.planner.limit: .* made with 3, found 4"):
+        Dataset.create(tmp_path, {"config": {"seed": 0, "planner": {"limit": 4}}})
+
+
+def test_differences_name_the_key() -> None:
+    found = list(differences({"a": {"b": 1, "c": 2}}, {"a": {"b": 1, "c": 3}, "d": 4}))
+    assert found == [("a.c", 2, 3), ("d", None, 4)]
+    assert list(differences({"a": {"b": 1}}, {"a": {"b": 2}}, ignore=["a.b"])) == []
+
+
+def test_paths_follow_the_layout(dataset: Dataset) -> None:
+    def within(path: Path) -> str:
+        return str(path.relative_to(dataset.path))
+
+    assert within(dataset.shard_path("scenes", **KEYS)) == (
+        "scenes/split=train/shard-000000.parquet"
+    )
+    assert within(dataset.shard_path("labels", split="test", shard=12, predicate="on")) == (
+        "labels/predicate=on/split=test/shard-000012.parquet"
+    )
+    assert within(dataset.images_path("train", 3)) == "images/split=train/shard-000003.tar"
+    with pytest.raises(DatasetError, match=r"expected predicate, split, shard.*found split, shard"):
+        dataset.shard_path("plans", **KEYS)
+    with pytest.raises(DatasetError, match=r"split 'tset': expected one of train, validation"):
+        dataset.shard_path("scenes", split="tset", shard=0)
+    with pytest.raises(DatasetError, match=r"name '../x'"):
+        dataset.shard_path("checkpoints", name="../x")
+
+
+# rows ------------------------------------------------------------------------------------------
+
+
+def test_rows_come_back(dataset: Dataset) -> None:
+    scenes = fill(dataset)
+    rows = [scene_values(s, i) for i, s in enumerate(scenes)]
+    assert dataset.read_rows("scenes") == rows
+    assert dataset.read_rows("scenes", split="train", index=2) == rows[2:3]
+    assert dataset.read_rows("scenes", split="test") == []
+    assert dataset.has("scenes", **KEYS)
+    assert not dataset.has("scenes", split="train", shard=1)
+    assert dataset.shards("train") == [0]
+    with pytest.raises(DatasetError, match="has no column 'colour'"):
+        dataset.read_rows("scenes", colour="red")
+
+
+def test_equal_rows_give_equal_bytes(dataset: Dataset, tmp_path: Path) -> None:
+    fill(dataset)
+    other = Dataset.create(tmp_path / "other", {})
+    time.sleep(1.1)  # a clock in a header would show
+    fill(other)
+    for path in ("scenes/split=train/shard-000000.parquet", "images/split=train/shard-000000.tar"):
+        assert (dataset.path / path).read_bytes() == (other.path / path).read_bytes(), path
+    rows = dataset.read_rows("scenes")
+    rows[0]["seed"] = 1
+    changed = other.write_rows("scenes", rows, **KEYS)
+    assert changed.read_bytes() != dataset.shard_path("scenes", **KEYS).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"index": "first"}, r"column index: expected BIGINT, found .*'first'"),
+        ({"n_objects": 2.5}, r"column n_objects: expected INTEGER, found"),
+        ({"seed": None}, r"column seed: expected BIGINT, found null in row 1"),
+        ({"colour": "red"}, r"row 1: column colour: not in schema scenes"),
+        ({"robot": {"base": [0.0, 0.0, 0.0], "yaw": float("nan")}}, r"column robot.*NaN.*\(yaw\)"),
+        ({"robot": {"yaw": 0.0}}, r"column robot: expected STRUCT.*null inside \(base\)"),
+        ({"robot": {"base": [0.0, 0.0], "yaw": 0.0}}, r"column robot: expected STRUCT"),
+        ({"robot": 3}, r"column robot: expected STRUCT"),
+    ],
+)
+def test_bad_rows_are_refused(dataset: Dataset, change: dict, message: str) -> None:
+    rows = [scene_values(scene(), 0), {**scene_values(scene(), 1), **change}]
+    with pytest.raises(DatasetError, match=message) as caught:
+        dataset.write_rows("scenes", rows, **KEYS)
+    assert str(dataset.shard_path("scenes", **KEYS)) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not dataset.has("scenes", **KEYS)
+
+
+def test_missing_key_is_null_only_where_null_is_allowed(dataset: Dataset) -> None:
+    row = label_values(scene(), "red", True)
+    del row["query"]
+    with pytest.raises(DatasetError, match="column query: expected VARCHAR, found null in row 0"):
+        dataset.write_rows("labels", [row], **LABELS)
+    rows = [{**scene_values(scene(), 0)}]
+    assert rows[0]["objects"][0]["on"] is None  # a nullable field of a struct
+    dataset.write_rows("scenes", rows, **KEYS)
+
+
+def test_a_write_that_fails_leaves_the_old_file(dataset: Dataset) -> None:
+    fill(dataset)
+    path = dataset.shard_path("scenes", **KEYS)
+    before = path.read_bytes()
+    with pytest.raises(DatasetError):
+        dataset.write_rows("scenes", [{"scene_id": "x"}], **KEYS)
+
+    def stop_half_way() -> None:
+        with replacing(path) as temporary:
+            temporary.write_bytes(b"half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        stop_half_way()
+    assert path.read_bytes() == before
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def test_a_killed_writer_leaves_nothing_that_a_reader_sees(dataset: Dataset) -> None:
+    fill(dataset)
+    program = (
+        "import sys, time\nfrom pathlib import Path\nfrom relevance.store import replacing\n"
+        "with replacing(Path(sys.argv[1])) as temporary:\n"
+        "    temporary.write_bytes(b'half')\n    print('ready', flush=True)\n    time.sleep(60)\n"
+    )
+    target = dataset.shard_path("scenes", split="train", shard=1)
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(target)], stdout=subprocess.PIPE
+    ) as writer:
+        assert writer.stdout is not None
+        assert writer.stdout.readline() == b"ready\n"
+        writer.send_signal(signal.SIGKILL)
+    left = [file for file in target.parent.iterdir() if file.suffix == ".tmp"]
+    assert len(left) == 1, "the writer was killed while the temporary file was there"
+    assert dataset.shards("train") == [0]
+    with dataset.connect() as connection:
+        assert connection.execute("SELECT count(*) FROM scenes").fetchone() == (4,)
+    os.utime(left[0], (0, 0))
+    Dataset.create(dataset.path, dataset.description)
+    assert not left[0].exists(), "old temporary files are swept away"
+
+
+def test_every_flipped_byte_is_noticed(dataset: Dataset) -> None:
+    fill(dataset)
+    path = dataset.shard_path("scenes", **KEYS)
+    content = path.read_bytes()
+    assert len(dataset.read_rows("scenes")) == 4
+    for place in {*range(0, len(content), 61), *range(len(content) - 40, len(content))}:
+        changed = bytearray(content)
+        changed[place] ^= 0x04
+        path.write_bytes(changed)
+        with pytest.raises(DatasetError, match=re.escape(str(path))) as caught:
+            dataset.read_rows("scenes")
+        assert "\n" not in str(caught.value)
+
+
+def broken_parquet(path: Path, how: str) -> None:
+    content = pq.read_table(path)
+    footer = {
+        key.decode(): value.decode()
+        for key, value in pq.read_metadata(path).metadata.items()
+        if key.startswith(b"relevance.")
+    }
+    if how == "column":
+        content = content.drop_columns(["seed"])
+    elif how == "type":
+        place = content.schema.get_field_index("seed")
+        content = content.set_column(place, "seed", content["seed"].cast(pa.string()))
+    elif how == "extra":
+        content = content.append_column("note", pa.array(["x"] * len(content)))
+    elif how == "version":
+        footer["relevance.version"] = "99"
+    elif how == "foreign":
+        footer = {}
+    with pq.ParquetWriter(path, content.schema) as writer:
+        writer.write_table(content)
+        writer.add_key_value_metadata(footer)
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("column", r"column seed: expected BIGINT, found no such column"),
+        ("type", r"column seed: expected BIGINT, found VARCHAR"),
+        ("extra", r"column note: expected no such column, found VARCHAR"),
+        ("version", r"version of the schema: expected 1, found 99"),
+        ("foreign", r"table of the schema: expected scenes, found none"),
+        ("same", r"content hash: expected [0-9a-f]{16}, found [0-9a-f]{16}"),
+    ],
+)
+def test_a_file_that_is_not_the_schemas(dataset: Dataset, how: str, message: str) -> None:
+    fill(dataset)
+    path = dataset.shard_path("scenes", **KEYS)
+    broken_parquet(path, how)
+    with pytest.raises(DatasetError, match=re.escape(str(path)) + ": " + message):
+        dataset.read_rows("scenes")
+    if how != "same":  # queries look at footers, not at every byte
+        with pytest.raises(DatasetError, match=message):
+            sql(dataset.path, "SELECT 1")
+
+
+def test_truncated_and_missing_parquet(dataset: Dataset) -> None:
+    fill(dataset)
+    path = dataset.shard_path("scenes", **KEYS)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(DatasetError, match=r"shard-000000.parquet: expected a whole Parquet file"):
+        dataset.read_rows("scenes")
+    path.unlink()
+    with pytest.raises(DatasetError, match=r"shard-000000.parquet: .*(cannot be read|not exist)"):
+        list(dataset.samples("train", [0]))
+
+
+# images ----------------------------------------------------------------------------------------
+
+
+def test_images_come_back_to_the_pixel(dataset: Dataset) -> None:
+    scenes = fill(dataset)
+    samples = list(dataset.samples("train"))
+    assert [sample.key for sample in samples] == [s.id for s in scenes]
+    for sample, expected in zip(samples, scenes, strict=True):
+        stored = pictures(expected)
+        assert sample.scene == expected
+        np.testing.assert_array_equal(sample.image, stored.image)
+        np.testing.assert_array_equal(sample.mask, stored.mask)
+        np.testing.assert_array_equal(sample.views, stored.views)
+    assert sample.views.shape == (3, 32, 32, 3)
+
+
+def test_samples_of_some_shards_and_shuffled(dataset: Dataset) -> None:
+    keys = {shard: [s.id for s in fill(dataset, shard)] for shard in range(3)}
+    assert [s.key for s in dataset.samples("train", [2, 0])] == keys[2] + keys[0]
+    everything = [key for shard in keys.values() for key in shard]
+    orders = [[s.key for s in dataset.samples("train", shuffle_seed=seed)] for seed in (0, 0, 1, 2)]
+    assert orders[0] == orders[1]
+    assert len({tuple(order) for order in orders}) == 3
+    assert all(sorted(order) == sorted(everything) for order in orders)
+    assert all(order != everything for order in orders)
+
+
+@pytest.mark.parametrize("size", [1000, 512 * 40, -512])
+def test_truncated_tar(dataset: Dataset, size: int) -> None:
+    fill(dataset)
+    path = dataset.images_path("train", 0)
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(DatasetError, match=r"shard-000000.tar: truncated: expected \d+ bytes"):
+        list(dataset.samples("train"))
+
+
+def test_changed_or_missing_tar(dataset: Dataset) -> None:
+    fill(dataset)
+    path = dataset.images_path("train", 0)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DatasetError, match=r"shard-000000.tar: content hash: expected"):
+        list(dataset.samples("train"))
+    path.unlink()
+    with pytest.raises(DatasetError, match=r"shard-000000.tar: cannot be read"):
+        list(dataset.samples("train"))
+
+
+def test_tar_members(dataset: Dataset) -> None:
+    first = fill(dataset, count=1)[0]
+    with tarfile.open(dataset.images_path("train", 0)) as tar:
+        assert tar.getnames() == [
+            f"{first.id}.{member}"
+            for member in ("mask.png", "scene.json", "scene.webp", "views.webp")
+        ]
+        assert {(item.mtime, item.uid, item.gid, item.uname) for item in tar} == {(0, 0, 0, "")}
+
+
+# queries ---------------------------------------------------------------------------------------
+
+
+def test_empty_tables_have_their_columns(dataset: Dataset) -> None:
+    with dataset.connect() as connection:
+        for table in TABLES:
+            found = connection.execute(f"DESCRIBE {table}").fetchall()
+            expected = table_schema(table).columns
+            assert [row[0] for row in found] == [column.name for column in expected]
+            for row, column in zip(found, expected, strict=True):
+                assert row[1].replace('"', "") == column.type.replace('"', "")
+            assert connection.execute(f"FROM {table}").fetchall() == []
+
+
+def test_views_over_real_files(dataset: Dataset) -> None:
+    scenes = fill(dataset)
+    rows = [
+        label_values(s, query, relevant)
+        for i, s in enumerate(scenes)
+        for query, relevant in (("red", True), ("blue", i == 0), ("green", False))
+    ]
+    dataset.write_rows("labels", rows, **LABELS)
+    columns, found = sql(dataset.path, "FROM label_balance")
+    balance = dict(zip(columns, found[0], strict=True))
+    assert len(found) == 1
+    assert (balance["plans"], balance["queries"], balance["relevant"]) == (4, 4, 1)
+    assert balance["relevant_share"] == 0.25
+    columns, found = sql(
+        dataset.path,
+        "SELECT name, place, stands_on, position FROM objects WHERE scene_id = "
+        f"'{scenes[1].id}' ORDER BY place",
+    )
+    assert found == [
+        ("red", 0, None, (0.01, 0.1, 0.04)),
+        ("blue", 1, "red", (0.01, 0.1, 0.105)),
+        ("green", 2, None, (0.01, -0.1, 0.025)),
+    ]
+    with dataset.connect(origin=True) as connection:
+        assert connection.execute("SELECT file, row FROM scenes ORDER BY row").fetchall() == [
+            ("scenes/split=train/shard-000000.parquet", row) for row in range(4)
+        ]
+
+
+def test_plain_duckdb_gives_the_same(dataset: Dataset, tmp_path: Path) -> None:
+    plain_name = tmp_path / "plain"
+    shutil.copytree(dataset.path, plain_name)
+    copy = Dataset.open(plain_name)
+    scenes = fill(copy)
+    rows = [label_values(s, query, query == "red") for s in scenes for query in s.names]
+    copy.write_rows("labels", rows, **LABELS)
+    with duckdb.connect() as plain:
+        plain.execute(f"SET VARIABLE dataset = '{plain_name}'")
+        made = set()
+        for statement in duckdb.extract_statements((SCHEMAS / "tables.sql").read_text()):
+            name = re.search(r"VIEW (\w+)", statement.query)
+            assert name is not None
+            made.add(name[1])
+            if copy.files(name[1]):
+                plain.execute(statement)
+            else:
+                with pytest.raises(duckdb.IOException, match="No files found"):
+                    plain.execute(statement)
+        assert made == set(TABLES)
+        views = (SCHEMAS / "views.sql").read_text()
+        for name in ("objects", "label_balance", "visibility", "scene_sizes", "split_overlap"):
+            query = re.search(rf"CREATE OR REPLACE VIEW {name} .*?;\n", views, re.DOTALL)
+            assert query is not None
+            plain.execute(query[0])
+            ours = sql(copy.path, f"FROM {name} ORDER BY ALL")[1]
+            theirs = plain.execute(f"FROM {name} ORDER BY ALL").fetchall()
+            # plain DuckDB reads a fixed-size list as a list
+            assert json.dumps(theirs) == json.dumps(ours)
+            assert ours or name == "split_overlap"
+        short = plain.execute(
+            f"SELECT count(*), min(predicate) FROM read_parquet('{plain_name}/labels/**/*.parquet',"
+            " hive_partitioning = true)"
+        ).fetchall()
+        assert short == [(12, "behind")]
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ("SELECT nope FROM scenes", r'query: Binder Error: Referenced column "nope" not found'),
+        ("SELEC", r"query: Parser Error"),
+        ("FROM nowhere", r"query: Catalog Error"),
+    ],
+)
+def test_bad_queries(dataset: Dataset, query: str, message: str) -> None:
+    with pytest.raises(DatasetError, match=message) as caught:
+        sql(dataset.path, query)
+    assert "\n" not in str(caught.value)
+
+
+def test_content_hash_follows_labels_and_images(dataset: Dataset) -> None:
+    scenes = fill(dataset)
+    hashes = [dataset.content_hash()]
+    dataset.write_rows("labels", [label_values(scenes[0], "red", True)], **LABELS)
+    hashes.append(dataset.content_hash())
+    dataset.write_rows("labels", [label_values(scenes[0], "red", False)], **LABELS)
+    hashes.append(dataset.content_hash())
+    fill(dataset, shard=1)
+    hashes.append(dataset.content_hash())
+    assert len(set(hashes)) == 4
+    assert Dataset.open(dataset.path).content_hash() == hashes[-1]
+    assert SPLITS == ("train", "validation", "test")
