@@ -1,1 +1,50 @@
-"""Datasets, models and guides that tell a task-and-motion planner which objects matter."""
+"""Datasets, models and guides that tell a task-and-motion planner which objects matter.
+
+    import relevance
+    scene = relevance.read_scenes("scenes.jsonl")[0]
+    guide = relevance.load_guide("checkpoint.pt", mode="prune-then-full")
+    result = relevance.plan(scene, "on-the-left(red, blue)", guide=guide)
+
+Names are imported when first used, so that `import relevance` stays light.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from relevance.evaluation import load_guide
+    from relevance.planner import Guide, PlannerConfig, PlanResult, plan
+    from relevance.scene import Goal, Scene, SceneError, read_scenes
+    from relevance.store import Dataset
+
+_HOMES = {
+    "Dataset": "relevance.store",
+    "Goal": "relevance.scene",
+    "Guide": "relevance.planner",
+    "PlanResult": "relevance.planner",
+    "PlannerConfig": "relevance.planner",
+    "Scene": "relevance.scene",
+    "SceneError": "relevance.scene",
+    "load_guide": "relevance.evaluation",
+    "plan": "relevance.planner",
+    "read_scenes": "relevance.scene",
+}
+
+__all__ = [
+    "Dataset",
+    "Goal",
+    "Guide",
+    "PlanResult",
+    "PlannerConfig",
+    "Scene",
+    "SceneError",
+    "load_guide",
+    "plan",
+    "read_scenes",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'relevance' has no attribute {name!r}")

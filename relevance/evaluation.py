@@ -20,7 +20,7 @@ from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from relevance.planner import (
     Scorer,
     plan,
 )
+from relevance.planner.search import Mode
 from relevance.scene import Goal, Predicate, Scene, content_hash
 from relevance.store import SPLITS, Dataset
 
@@ -50,12 +51,12 @@ class EvaluationError(ValueError):
 class EvaluationConfig:
     """What to rerun, and how often."""
 
-    guides: tuple[str, ...] = ("prune", "prune-then-full")
+    guides: tuple[Mode, ...] = ("prune", "prune-then-full")
     beta: float = 0.0
     """The working point: an object is kept iff score > -beta."""
     betas: tuple[float, ...] = (-2.0, 2.0, 4.0)
     """Further values at which `sweep_guide` is rerun, on the first `sweep_tasks` tasks."""
-    sweep_guide: str = "prune"
+    sweep_guide: Mode = "prune"
     tasks: int = 40
     """Tasks per predicate, drawn by the hash of their id; 0 takes all."""
     sweep_tasks: int = 20
@@ -63,7 +64,7 @@ class EvaluationConfig:
     repeats: int = 1
     """Timed runs of each task and guide; the median counts."""
     split: str = "test"
-    searches: tuple[str, ...] = ("tree",)
+    searches: tuple[Literal["tree", "informed"], ...] = ("tree",)
     """`tree` is the paper's uninformed baseline; `informed` our own stronger one."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     """Limits of the search; its own `search` is overridden by each of the ones above."""
@@ -190,7 +191,7 @@ def load_scorer(checkpoint: str | Path) -> NetworkScorer:
 
 
 def load_guide(
-    checkpoint: str | Path, *, mode: str = "prune-then-full", beta: float = 0.0
+    checkpoint: str | Path, *, mode: Mode = "prune-then-full", beta: float = 0.0
 ) -> Guide:
     """A guide for `plan` from a checkpoint file."""
     return Guide(scorer=load_scorer(checkpoint), mode=mode, beta=beta)
@@ -393,19 +394,22 @@ def compare(
     """
     scores, rows = scorer.scores(scene, goal), []
     for search in config.searches:
-        guides = [(guide, config.beta) for guide in config.guides]
+        guides: list[tuple[Mode, float]] = [(guide, config.beta) for guide in config.guides]
         if swept and search == config.searches[0]:
-            guides += [(config.sweep_guide, beta) for beta in (config.beta, *config.betas)]
-        runs: list[tuple[str, float] | None] = [None, *dict.fromkeys(guides)]
+            sweep: Mode = config.sweep_guide
+            guides.extend((sweep, beta) for beta in (config.beta, *config.betas))
+        runs: list[tuple[Mode, float] | None] = [None, *dict.fromkeys(guides)]
         planner = replace(config.planner, search=search)
-        timed: dict[tuple[str, float] | None, list[_Run]] = defaultdict(list)
+        timed: dict[tuple[Mode, float] | None, list[_Run]] = defaultdict(list)
         for repeat in range(config.repeats):
             for position in range(len(runs)):
                 which = runs[(position + turn + repeat) % len(runs)]
                 guide = which and Guide(scorer=scorer, mode=which[0], beta=which[1])
                 timed[which].append(_timed(scene, goal, planner, guide))
         unguided = timed.pop(None)
-        for (guide, beta), guided in sorted(timed.items(), key=lambda item: runs.index(item[0])):
+        for which in runs[1:]:
+            assert which is not None
+            (guide, beta), guided = which, timed[which]
             kept = {name for name, score in scores.items() if score > -beta}
             rows.append(
                 {

@@ -239,7 +239,9 @@ def prepare(root: str | Path, config: DatasetConfig, *, replan: bool = False) ->
         config = replace(config, **{split: Counts(**grown)})
     wanted = describe(config, specs)
     ignore = _GROWING + (_PLANNING if replan else ())
-    for key, found, expected in differences(there.description, wanted, ignore=ignore):
+    # read and written again: a setting that is younger than the dataset has its default there
+    before = {**there.description, "config": _CONFIG.dump_python(load_config(there), mode="json")}
+    for key, found, expected in differences(before, wanted, ignore=ignore):
         planning = key.startswith(_PLANNING)
         hint = "plan it anew (replan)" if planning else "take another folder or the same settings"
         raise DatasetError(

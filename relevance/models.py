@@ -272,10 +272,10 @@ class GlimpseBody(nn.Module):
             nn.ReLU(),
             nn.Conv2d(channels, channels, 1),
         )
-        self.view = _small_cnn(3, width)
+        self.view = _small_cnn(3, (channels // 2, channels, channels), width)
         self.view_key = nn.Linear(width, channels)
         self.sharpness = nn.Parameter(torch.tensor(2.5))
-        self.look = _small_cnn(4, width)
+        self.look = _small_cnn(4, (24, 48, 64), width)
         seen = 2 * width + 4
         self.estimate = nn.Sequential(nn.Linear(seen, width), nn.GELU(), nn.Linear(width, GEOMETRY))
         self.token = nn.Sequential(nn.Linear(seen + GEOMETRY, width), nn.GELU())
@@ -420,17 +420,18 @@ def _unit(x: Tensor) -> Tensor:
     return x.float() / 255 if x.dtype == torch.uint8 else x
 
 
-def _small_cnn(channels: int, width: int) -> nn.Sequential:
+def _small_cnn(channels: int, widths: tuple[int, int, int], width: int) -> nn.Sequential:
     """A 32x32 picture to a vector of `width`."""
+    a, b, c = widths
     return nn.Sequential(
-        nn.Conv2d(channels, 24, 4, stride=2, padding=1),
+        nn.Conv2d(channels, a, 4, stride=2, padding=1),
         nn.ReLU(),
-        nn.Conv2d(24, 48, 4, stride=2, padding=1),
+        nn.Conv2d(a, b, 4, stride=2, padding=1),
         nn.ReLU(),
-        nn.Conv2d(48, 64, 4, stride=2, padding=1),
+        nn.Conv2d(b, c, 4, stride=2, padding=1),
         nn.ReLU(),
         nn.Flatten(),
-        nn.Linear(64 * (PATCH // 8) ** 2, width),
+        nn.Linear(c * (PATCH // 8) ** 2, width),
         nn.ReLU(),
     )
 

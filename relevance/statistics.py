@@ -20,9 +20,7 @@ import numpy as np
 from relevance.generation import ShardSpec, load_config, shards_of
 from relevance.labels import stored_scene
 from relevance.scene import (
-    Goal,
     Pose,
-    Predicate,
     Scene,
     SceneError,
     goal_holds,
@@ -33,6 +31,8 @@ from relevance.store import MEMBERS, SCHEMAS, TABLES, Dataset, DatasetError
 
 PER_RULE = 20
 """Breaches of one rule that are listed; the rest is counted."""
+IN_MEMORY = 100_000_000
+"""Bytes of Parquet up to which `check` copies the tables before it queries them."""
 
 Progress = Callable[[int, int], None]
 
@@ -179,18 +179,23 @@ def check(
     dataset = Dataset.open(root)
     breaches = list(_description(dataset))
     files = [file for table in TABLES for file in dataset.files(table)]
-    broken: set[Path] = set()
+    unreadable: set[Path] = set()
+    odd: set[Path] = set()
     for done, file in enumerate(files, 1):
-        found = list(_file(dataset, file))
+        try:
+            found = list(_file(dataset, file, dataset.read_file(file)))
+        except DatasetError as error:
+            found = [_unreadable(dataset, file, error)]
+            unreadable.add(file)
         breaches += found
         if found:
-            broken.add(file)
+            odd.add(file)
         if progress:
             progress(done, len(files))
-    # A broken file would make every row that refers to it look wrong: leave its shard out.
-    left_out = {file for file in files for bad in broken if _same_shard(dataset, file, bad)}
+    # Every row that refers to an unreadable file would look wrong: leave its shard out.
+    left_out = {file for file in files for bad in unreadable if _same_shard(dataset, file, bad)}
     breaches += _rules(dataset, left_out)
-    whole = [file for file in dataset.files("scenes") if file not in left_out]
+    whole = [file for file in dataset.files("scenes") if file not in odd]
     breaches += _scenes(dataset, whole, render)
     breaches += _goals(dataset, left_out)
     return breaches
@@ -214,20 +219,19 @@ def _description(dataset: Dataset) -> Iterator[Breach]:
                 )
 
 
-def _file(dataset: Dataset, file: Path) -> Iterator[Breach]:
-    """What one Parquet file shows by itself: readable, unchanged, right schema, right settings."""
+def _unreadable(dataset: Dataset, file: Path, error: DatasetError) -> Breach:
+    text = _message(dataset, error)
+    column = re.match(r"column (\w+): ", text)
+    return Breach(
+        file=_name(dataset, file),
+        column=column[1] if column else None,
+        message=text[column.end() :] if column else text,
+    )
+
+
+def _file(dataset: Dataset, file: Path, body: Any) -> Iterator[Breach]:
+    """What one readable file shows by itself: made with the dataset's settings; its tar."""
     name = _name(dataset, file)
-    try:
-        body = dataset.read_file(file)
-    except DatasetError as error:
-        text = _message(dataset, error)
-        column = re.match(r"column (\w+): ", text)
-        yield Breach(
-            file=name,
-            column=column[1] if column else None,
-            message=text[column.end() :] if column else text,
-        )
-        return
     table = name.split("/")[0]
     description = dataset.description
     expected = {
@@ -275,7 +279,8 @@ def _file(dataset: Dataset, file: Path) -> Iterator[Breach]:
 def _rules(dataset: Dataset, left_out: set[Path]) -> Iterator[Breach]:
     """The breaches of every rule of `schemas/checks.sql`."""
     partial = any(file.relative_to(dataset.path).parts[0] == "scenes" for file in left_out)
-    with dataset.connect(origin=True, without=left_out) as connection:
+    size = sum(file.stat().st_size for table in TABLES for file in dataset.files(table))
+    with dataset.connect(origin=True, without=left_out, memory=size < IN_MEMORY) as connection:
         for rule, query in rules().items():
             if partial and rule.startswith("predictions"):
                 continue  # their scenes may be among those left out
@@ -300,7 +305,7 @@ def _scenes(dataset: Dataset, files: list[Path], render: bool) -> Iterator[Breac
     """Every scene is possible and what its id says; one a shard renders to equal pixels."""
     for file in files:
         name = _name(dataset, file)
-        scenes: list[Scene] = []
+        scenes: dict[str, Scene] = {}
         for row, values in enumerate(dataset.read_file(file).to_pylist()):
             try:
                 scene = stored_scene(values, where="")
@@ -314,15 +319,15 @@ def _scenes(dataset: Dataset, files: list[Path], render: bool) -> Iterator[Breac
                     column="scene_id",
                     message=f"expected {scene.id}, the hash of the row, found {values['scene_id']}",
                 )
-            scenes.append(scene)
+            scenes[values["scene_id"]] = scene
         where = _where(dataset, file)
         images = _name(dataset, dataset.images_path(**where))
         with tarfile.open(fileobj=io.BytesIO(dataset.read_images(**where))) as archive:
-            for scene in scenes:
-                member = archive.extractfile(f"{scene.id}.scene.json")
-                if member is None or scene_from_json(member.read()) != scene:
+            for key, scene in scenes.items():
+                member = archive.extractfile(f"{key}.scene.json")
+                if member is None or scene_from_json(member.read()).objects != scene.objects:
                     yield Breach(
-                        file=images, message=f"{scene.id}.scene.json: expected the scene of its row"
+                        file=images, message=f"{key}.scene.json: expected the scene of its row"
                     )
         if render and scenes:
             yield from _pixels(dataset, where, images)
@@ -353,19 +358,19 @@ def _goals(dataset: Dataset, left_out: set[Path]) -> Iterator[Breach]:
         for row, plan in enumerate(dataset.read_file(file).to_pylist()):
             if not plan["holds"] or plan["scene_id"] not in scenes:
                 continue
-            goal = Goal(
-                predicate=Predicate(plan["predicate"]),
-                subject=plan["subject"],
-                reference=plan["reference"],
-            )
             final = {
                 item["name"]: Pose(position=tuple(item["position"]), yaw=item["yaw"], on=item["on"])
                 for item in plan["final"]
             }
             try:
-                fulfilled = goal_holds(stored_scene(scenes[plan["scene_id"]]).moved(final), goal)
-            except SceneError:
-                continue  # reported with the scene
+                scene = stored_scene(scenes[plan["scene_id"]])
+                goal = scene.goal(f"{plan['predicate']}({plan['subject']}, {plan['reference']})")
+            except SceneError as error:
+                yield Breach(
+                    file=_name(dataset, file), row=row, column="subject", message=str(error)
+                )
+                continue
+            fulfilled = goal_holds(scene.moved(final), goal)
             if not fulfilled:
                 yield Breach(
                     file=_name(dataset, file),

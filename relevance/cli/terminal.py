@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any, Literal
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -59,12 +60,14 @@ def show(
             for row in rows
         )
     else:
-        table = Table(*columns, title=title, title_justify="left")
+        table = Table(title=title, title_justify="left")
+        for name in columns:
+            table.add_column(escape(name), overflow="fold")
         for row in rows:
-            table.add_row(*[f"{x:.6g}" if isinstance(x, float) else str(x) for x in row])
-        out = Console()
-        # Cut off by nothing when it goes into a file or a pipe.
-        out.print(table, width=None if out.is_terminal else 100_000, markup=False)
+            cells = [f"{x:.6g}" if isinstance(x, float) else str(x) for x in row]
+            table.add_row(*[escape(cell) for cell in cells])
+        # A file or a pipe takes lines of any length.
+        Console(width=None if sys.stdout.isatty() else 10_000).print(table)
 
 
 def say(text: str) -> None:

@@ -19,12 +19,15 @@ from numba import njit
 
 from relevance.planner.kernels.boxes import dense_solve, near, separation
 from relevance.planner.kernels.native import call
-from relevance.planner.kinematics import ARM, FRAME, HAND, Panda, hand_down
+from relevance.planner.kinematics import ARM, FRAME, HAND, Panda
 
 CLEARANCE = 0.0025
 """Clearance asked of every pair at a switch, m (the pose bound's MARGIN is larger)."""
 TOLERANCE = 2e-4
 """Largest violation (m, rad) of a solved problem."""
+STAY = (100.0, 1e5)
+"""Weights of a placement's distance from what the pose bound found (m^-2), tried in turn: with
+less, the pull of short joint motion drags boxes into wells between obstacles."""
 _OUTER, _INNER = 8, 12
 
 
@@ -46,7 +49,9 @@ def bodies(arm: Panda, opening: float, carried: tuple | None = None) -> Bodies:
     for low, high in arm.finger:
         for side in (1.0, -1.0):
             centre, half = (low + high) / 2, (high - low) / 2
-            rows.append((HAND, np.array([centre[0], side * (centre[1] + opening), centre[2]]), half))
+            rows.append(
+                (HAND, np.array([centre[0], side * (centre[1] + opening), centre[2]]), half)
+            )
     if carried is not None:
         rows.append((HAND, *carried))
     return Bodies(
@@ -136,7 +141,12 @@ def _assemble(
         for i in range(4):
             frames_x[ARM + i] = grasp_x[ARM + i] = base[i]
         if placing:
-            grasp_x[11], grasp_x[12], grasp_x[13], grasp_x[14] = x[at], x[at + 1], place_z[j], x[at + 2]
+            grasp_x[11], grasp_x[12], grasp_x[13], grasp_x[14] = (
+                x[at],
+                x[at + 1],
+                place_z[j],
+                x[at + 2],
+            )
         else:
             for i in range(4):
                 grasp_x[11 + i] = pick_target[j, i]
@@ -247,7 +257,7 @@ def solve(
     H, g = np.zeros((n, n)), np.zeros(n)
     eq, limit, edge = np.zeros((2 * m, 6)), np.zeros((2 * m, ARM, 2)), np.zeros((m, 8))
     ineq = np.zeros((2 * m, link.shape[1], len(obstacles)))
-    mu, worst = 100.0, 1e9
+    mu, worst, before = 1000.0, 1e9, 1e9
     for outer in range(_OUTER):
         for _ in range(_INNER):
             merit, worst = _assemble(
@@ -278,6 +288,9 @@ def solve(
                 break
         if worst < TOLERANCE / 2 and outer > 0:
             return worst
+        if outer >= 3 and worst > 0.7 * before:
+            return worst  # stuck
+        before = worst
         _assemble(
             x, m, start, p0, weight, pick_target, place_z, turn, base, lower, upper, link, centre,
             half, n_bodies, obstacles, stands, moved, support, region, table, frames_x, frames_y,
@@ -285,6 +298,3 @@ def solve(
         )  # fmt: skip
         mu = min(mu * 5.0, 1e5)
     return worst
-
-
-__all__ = ["Bodies", "bodies", "body_pose", "hand_down", "point_gradient", "solve"]

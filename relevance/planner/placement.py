@@ -21,7 +21,7 @@ from relevance.scene import Box
 
 MARGIN = 0.003
 """Clearance that placements keep, m; the later bounds ask for less, so they never refuse it."""
-PICK_MARGIN = 0.002
+PICK_MARGIN = 0.003
 """Clearance of the gripper around a box that it takes, m."""
 DEPTH = 0.025
 """How far the finger tips reach below the top of the box that they hold, m."""
@@ -97,9 +97,7 @@ def pick_blockers(box: Box, grasp: Grasp, others: list[Box]) -> frozenset[str]:
         )
         # Something that overhangs the box blocks the way up.
         above = other.bottom >= box.top - 2e-3 and (
-            clearance(
-                box.position[0], box.position[1], angle, box.top, grasp.parts[:1], o[None, :]
-            )
+            clearance(box.position[0], box.position[1], angle, box.top, grasp.parts[:1], o[None, :])
             < 0
         )
         if gap < PICK_MARGIN or above or other.on == box.name:
@@ -118,7 +116,8 @@ def clearance(x, y, angle, bottom, parts, obstacles):
         radius = math.sqrt(along * along + across * across)
         for k in range(len(obstacles)):
             o = obstacles[k]
-            if o[2] + o[6] <= bottom + under + 1e-3:
+            # The box itself comes down onto its support; the gripper stays clear of what is below.
+            if o[2] + o[6] <= bottom + under + (1e-3 if i == 0 and under == 0.0 else -MARGIN):
                 continue
             flat = radius + math.sqrt(o[4] * o[4] + o[5] * o[5]) + best
             dx, dy = o[0] - px, o[1] - py

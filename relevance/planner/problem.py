@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from relevance.planner import keyframes, logic, path, placement
-from relevance.planner.kinematics import ARM, FRAME, HAND, HOME, hand_down, panda, reach_interval
 from relevance.planner.kernels.native import call
-from relevance.planner.placement import FOUND, NONE, UNDECIDED, Grasp
+from relevance.planner.kinematics import ARM, FRAME, HAND, HOME, hand_down, panda, reach_interval
+from relevance.planner.placement import FOUND, UNDECIDED, Grasp
 from relevance.scene import Box, Goal, Phase, Pose, Predicate, Scene, region
 
 REGION_MARGIN = 0.001
@@ -92,9 +91,7 @@ class Problem:
             others = [other for other in self.scene.objects if other.name != box.name]
             usable = [g for g in placement.grasps(box) if self._reachable(box, g)]
             self.grasps[box.name] = tuple(usable)
-            self.blockers[box.name] = tuple(
-                placement.pick_blockers(box, g, others) for g in usable
-            )
+            self.blockers[box.name] = tuple(placement.pick_blockers(box, g, others) for g in usable)
         self.counts.pose += len(self.boxes)
         self.seconds.pose += time.process_time() - began
 
@@ -129,14 +126,14 @@ class Problem:
         return tuple(grasp for grasp, blocking in pairs if blocking <= gone)
 
     def goal_pose(
-        self, gone: frozenset[str], grasp: Grasp, reference: Box, extra: Sequence[np.ndarray] = ()
+        self, gone: frozenset[str], grasp: Grasp, reference: Box
     ) -> tuple[float, float, float] | None:
         """A free pose of the subject that makes the goal true once `gone` have left.
 
         None refuses every sequence that moves no others: whoever has left is ignored here, so
         the bound is a relaxation.
         """
-        key = (gone, grasp.axis, reference.position, reference.yaw) if not extra else None
+        key = (gone, grasp.axis, reference.position, reference.yaw)
         if key in self._memo:
             return self._memo[key]
         subject = self.boxes[self.goal.subject]
@@ -148,10 +145,8 @@ class Problem:
         ]
         standing.append(placement.obstacle(reference))
         area = self.goal_region(reference)
-        pose = self._find(area, area[:2], bottom, subject, grasp, [*standing, *extra])
-        if key is not None:
-            self._memo[key] = pose
-        return pose
+        self._memo[key] = self._find(area, area[:2], bottom, subject, grasp, standing)
+        return self._memo[key]
 
     def goal_region(self, reference: Box) -> np.ndarray:
         """Rectangle for the subject's centre: x, y, angle, half extents (5,)."""
@@ -188,17 +183,15 @@ class Problem:
         """
         subject = self.boxes[self.goal.subject]
         gone = frozenset(order)
-        reference = self.boxes[self.goal.reference]
-        for moved_reference in self._references(order):
-            pose = self.goal_pose(gone - {subject.name}, grasp, moved_reference)
+        for reference in self._references(order):
+            pose = self.goal_pose(gone - {subject.name}, grasp, reference)
             if pose is None:
                 continue
-            bottom = moved_reference.top if self.goal.predicate is Predicate.ON else 0.0
+            bottom = reference.top if self.goal.predicate is Predicate.ON else 0.0
             kept = _volumes(subject, grasp, pose, bottom)
-            found = self._place_blockers(order, kept, moved_reference)
+            found = self._place_blockers(order, kept, reference)
             if found is not None:
                 return [*found, Placement(grasp=grasp, pose=pose)]
-        del reference
         return None
 
     def _references(self, order: tuple[str, ...]) -> list[Box]:
@@ -207,9 +200,7 @@ class Problem:
         if reference.name not in order:
             return [reference]
         found, gone = [], frozenset(order)
-        standing = [
-            placement.obstacle(box) for box in self.scene.objects if box.name not in gone
-        ]
+        standing = [placement.obstacle(box) for box in self.scene.objects if box.name not in gone]
         for grasp in self.pickable(reference.name, frozenset(order[: order.index(reference.name)])):
             for prefer in ((0.0, 0.0), (-0.1, 0.25), (-0.1, -0.25), (0.1, 0.15), (0.1, -0.15)):
                 pose = self._find(self._table(), prefer, 0.0, reference, grasp, standing)
@@ -230,13 +221,15 @@ class Problem:
             box = self.boxes[name]
             gone = frozenset(order[: i + 1])
             standing = [placement.obstacle(b) for b in self.scene.objects if b.name not in gone]
-            later = [o for o in self._later_picks(order[i + 1 :]) if o[2] - o[6] < box.size[2]]
-            reserved = [o for o in kept if o[2] - o[6] < box.size[2]]
+            top = box.size[2] + placement.MARGIN
+            later = [o for o in self._later_picks(order[i + 1 :]) if o[2] - o[6] < top]
+            reserved = [o for o in kept if o[2] - o[6] < top]
             found = None
             for grasp in self.pickable(name, frozenset(order[:i])):
                 if name == reference.name:
-                    prefer, area = reference.position[:2], np.array(
-                        [*reference.position[:2], 0.0, 0.002, 0.002]
+                    prefer, area = (
+                        reference.position[:2],
+                        np.array([*reference.position[:2], 0.0, 0.002, 0.002]),
                     )
                 else:
                     prefer, area = box.position[:2], self._table()
@@ -249,9 +242,7 @@ class Problem:
             if found is None:
                 return None
             placed.append(found)
-            landed.append(
-                placement.obstacle(_moved_box(box, found.grasp, found.pose, 0.0, None))
-            )
+            landed.append(placement.obstacle(_moved_box(box, found.grasp, found.pose, 0.0, None)))
         return placed
 
     def _later_picks(self, names: tuple[str, ...]) -> list[np.ndarray]:
@@ -289,7 +280,7 @@ class Problem:
         pick_target, place_z, turn = np.zeros((m, 4)), np.zeros(m), np.zeros((m, 2))
         bounds = np.zeros((m, 2))
         x = np.zeros(17 * m)
-        p0, weight = np.zeros(3 * m), np.ones(3 * m)
+        p0, weight = np.zeros(3 * m), np.zeros(3 * m)
         for j, (name, place) in enumerate(zip(order, placements, strict=True)):
             box, grasp = self.boxes[name], place.grasp
             bottom = 0.0
@@ -300,8 +291,6 @@ class Problem:
             place_z[j] = bottom + box.size[2] / 2 + grasp.above
             turn[j] = grasp.axis * math.pi / 2, bottom + box.size[2] / 2
             p0[3 * j : 3 * j + 3] = place.pose
-            if name == self.goal.reference:
-                weight[3 * j : 3 * j + 3] = 1e6  # the subject's region was laid out around it
             for k, carried in ((2 * j, None), (2 * j + 1, _carried(box, grasp))):
                 body = keyframes.bodies(arm, grasp.opening, carried)
                 n_bodies[k] = len(body.link)
@@ -323,15 +312,22 @@ class Problem:
         if reference.name in order:
             j = order.index(reference.name)
             reference = _moved_box(reference, placements[j].grasp, placements[j].pose, 0.0, None)
-        violation = keyframes.solve(
-            x, m, HOME, p0, weight, pick_target, place_z, turn, self.base, arm.lower, arm.upper,
-            link, centre, half, n_bodies, obstacles, stands, moved, supports,
-            self.goal_region(reference), bounds, arm.frames.x, arm.frames.y, arm.frames.handle,
-            arm.grasp.x, arm.grasp.y, arm.grasp.handle,
-        )  # fmt: skip
-        if violation > keyframes.TOLERANCE:
-            return None
-        return x[: 14 * m].reshape(2 * m, ARM), x[14 * m :].reshape(m, 3)
+        start = x.copy()
+        for stay in keyframes.STAY:
+            weight[:] = stay
+            if reference.name in order:  # the subject's region was laid out around it
+                j = order.index(reference.name)
+                weight[3 * j : 3 * j + 3] = 1e6
+            x[:] = start
+            violation = keyframes.solve(
+                x, m, HOME, p0, weight, pick_target, place_z, turn, self.base, arm.lower,
+                arm.upper, link, centre, half, n_bodies, obstacles, stands, moved, supports,
+                self.goal_region(reference), bounds, arm.frames.x, arm.frames.y,
+                arm.frames.handle, arm.grasp.x, arm.grasp.y, arm.grasp.handle,
+            )  # fmt: skip
+            if violation <= keyframes.TOLERANCE:
+                return x[: 14 * m].reshape(2 * m, ARM), x[14 * m :].reshape(m, 3)
+        return None
 
     def table(self) -> np.ndarray:
         """The table as an obstacle."""
@@ -472,6 +468,3 @@ def _volumes(box: Box, grasp: Grasp, pose, bottom: float) -> list[np.ndarray]:
         x, y = pose[0] + math.cos(pose[2]) * offset, pose[1] + math.sin(pose[2]) * offset
         rows.append(np.array([x, y, (low + high) / 2, pose[2], along, across, (high - low) / 2]))
     return rows
-
-
-__all__ = ["NONE", "Counts", "Motion", "Placement", "Problem", "Seconds"]

@@ -16,6 +16,7 @@ from typing import Any
 
 import jinja2
 import numpy as np
+from markupsafe import Markup
 
 from relevance.report import plots
 from relevance.report.figures import (
@@ -95,19 +96,22 @@ def percent(value: float | None, decimals: int = 1) -> str:
     return DASH if value is None or not math.isfinite(value) else f"{100 * value:.{decimals}f}%"
 
 
-def times(interval: Interval) -> str:
+def times(interval: Interval) -> Markup:
     """A ratio with its interval."""
     if not math.isfinite(interval.value):
-        return DASH
-    return f"{interval.value:.2f}{TIMES} ({interval.low:.2f} to {interval.high:.2f})"
+        return Markup(DASH)
+    low, high = f"{interval.low:.2f}", f"{interval.high:.2f}"
+    return Markup("{}{} <small>{} to {}</small>").format(f"{interval.value:.2f}", TIMES, low, high)
 
 
-def spread(interval: Interval) -> str:
+def spread(interval: Interval) -> Markup:
     """A time with its interval."""
     if not math.isfinite(interval.value):
-        return DASH
-    low, high = plots.seconds(interval.low), plots.seconds(interval.high)
-    return f"{plots.seconds(interval.value)} ({low} to {high})"
+        return Markup(DASH)
+    value, low, high = map(plots.seconds, (interval.value, interval.low, interval.high))
+    if low.split()[-1:] == high.split()[-1:]:
+        low = low.split()[0]
+    return Markup("{} <small>{} to {}</small>").format(value, low, high)
 
 
 def number(value: float | int | None, decimals: int = 0) -> str:
@@ -201,9 +205,7 @@ def _data(rows: Any) -> dict[str, Any]:
         "visible": visible[0],
         "n_scenes": sum(row["scenes"] for row in sizes),
         "n_labels": sum(row["queries"] or 0 for row in pooled),
-        "shares_plot": plots.svg("labels", plots.label_shares, size=(6.4, 2.6), rows=pooled)
-        if pooled
-        else "",
+        "shares_plot": plots.svg("labels", plots.label_shares, rows=pooled) if pooled else "",
         "lengths_plot": plots.svg("lengths", plots.lengths, rows=lengths) if lengths else "",
     }
 
@@ -279,7 +281,7 @@ def _planner(rows: Any) -> dict[str, Any]:
         "reasons_plot": plots.svg(
             "reasons",
             plots.reasons,
-            size=(6.4, 0.75 + 0.3 * min(len(reasons), 12)),
+            size=(4.8, 0.75 + 0.3 * min(len(reasons), 12)),
             rows=reasons[:12],
         )
         if reasons
@@ -332,7 +334,7 @@ def _model(
     model["with_goal_objects"] = [(group, everything.of(group).accuracy()) for group in groups]
     model["n_tasks"] = len(np.unique(predictions.task))
     model["plots"] |= {
-        "accuracy": plots.svg("accuracy", plots.accuracy, size=(6.4, 3.6), predictions=predictions),
+        "accuracy": plots.svg("accuracy", plots.accuracy, size=(4.8, 3.8), predictions=predictions),
         "beta": plots.svg(
             "beta", plots.beta_accuracy, size=(9.2, 3.1), panels=2, predictions=predictions
         ),

@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from relevance.report.figures import Comparison, Predictions, guided_cost, mean_interval
 from relevance.scene import Predicate
@@ -47,7 +47,7 @@ SHARES = (
     ("true irrelevant", "true_irrelevant", "#8a939d"),
     ("total", "total", "#22282f"),
 )
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "svg.fonttype": "none",
@@ -78,7 +78,7 @@ def svg(
     name: str,
     draw: Callable[..., None],
     *,
-    size: tuple[float, float] = (6.4, 2.9),
+    size: tuple[float, float] = (4.8, 2.9),
     panels: int = 1,
     **given: Any,
 ) -> str:
@@ -101,14 +101,16 @@ def svg(
     return re.sub(r'<svg[^>]*?(viewBox="[^"]*")[^>]*>', r'<svg \1 role="img">', text, count=1)
 
 
-def _percent_axis(axis: Any, decimals: int = 0) -> None:
-    axis.set_major_formatter(PercentFormatter(1.0, decimals=decimals))
+def _percent_axis(axis: Any) -> None:
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{round(100 * value, 2):g}%"))
 
 
 def seconds(value: float) -> str:
     """Seconds in the unit that reads best."""
     if not math.isfinite(value):
         return DASH
+    if value == 0:
+        return "0"
     if value >= 100:
         return f"{value:.0f} s"
     if value >= 1:
@@ -122,22 +124,16 @@ def label_shares(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     shares = [row["relevant_share"] or 0.0 for row in rows]
     colors = [GROUP_COLOR[Predicate(group).family] for group in groups]
     ax.barh(y, shares, height=0.56, color=colors)
+    end = max([*shares, 0.3]) * 1.08
     for at, row, share in zip(y, rows, shares, strict=True):
-        ax.text(
-            share + 0.005,
-            at,
-            f"{100 * share:.1f}%  n = {row['queries']}",
-            va="center",
-            fontsize=8.5,
-        )
+        text = f"{100 * share:.1f}% of {row['queries']}"
+        ax.text(end * 1.03, at, text, va="center", fontsize=8.5)
         paper = PAPER_RELEVANT[Predicate(row["predicate"]).family]
-        ax.plot([paper, paper], [at - 0.36, at + 0.36], color=INK, linewidth=1.4)
-    ax.plot([], [], color=INK, linewidth=1.4, label="paper")
-    ax.legend(loc="lower right")
+        ax.plot([paper, paper], [at - 0.38, at + 0.38], color=INK, linewidth=1.6)
     ax.set_yticks(y, groups)
-    ax.set_xlim(0, max([*shares, 0.3]) * 1.35)
+    ax.set_xlim(0, end)
     ax.grid(axis="y", visible=False)
-    ax.set_xlabel("relevant among queries")
+    ax.set_xlabel("relevant among queries; black: the paper's")
     _percent_axis(ax.xaxis)
 
 
@@ -188,7 +184,7 @@ def times(ax: Axes, times: dict[str, np.ndarray]) -> None:
     ax.set_xlim(right=max(20.0, *(float(v.max()) for v in times.values())))
     ax.set_xlabel("planning time of a task")
     ax.set_ylabel("share of tasks done")
-    ax.legend(loc="lower right", bbox_to_anchor=(1, 0.1))
+    ax.legend(loc="upper center", bbox_to_anchor=(0.45, -0.2))
     _percent_axis(ax.yaxis)
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: seconds(value)))
 
@@ -206,13 +202,13 @@ def accuracy(ax: Axes, predictions: Predictions) -> None:
     for row, group in enumerate(groups):
         base = predictions.of(group).accuracy().base_rate
         y = len(groups) - 1 - row
-        label = None if row else "always irrelevant (base rate of the total)"
+        label = None if row else "base rate of the total"
         ax.plot([base, base], [y - 0.4, y + 0.4], ":", color=INK, linewidth=1.2, label=label)
     ax.plot([], [], "|", color=MUTED, markersize=9, markeredgewidth=1.6, label="paper")
     ax.set_yticks(range(len(groups) - 1, -1, -1), groups)
     ax.grid(axis="y", visible=False)
     ax.set_xlabel("queries judged rightly")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.45, -0.16), ncols=5, columnspacing=1.2)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.4, -0.17), ncols=3, columnspacing=1.2)
     _percent_axis(ax.xaxis)
 
 

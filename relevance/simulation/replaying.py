@@ -40,7 +40,7 @@ _GRASP_TOLERANCE = 2e-3  # how far a finger may be off the face of the box that 
 _FLAT = 0.01  # tilt of a box that rests, rad
 _EPSILON = 1e-6
 # Links that can meet without being neighbours: the wrist and hand against the lower arm.
-_SELF_PAIRS = tuple((a, b) for a in (6, _HAND, *_FINGERS) for b in (_BASE, 0, 1, 2, 3))
+_SELF_PAIRS = {(a, b) for a in (6, _HAND, *_FINGERS) for b in (_BASE, 0, 1, 2, 3)}
 _RENEW_AFTER = 200  # removed bodies leak; a fresh world now and then bounds it
 
 
@@ -121,6 +121,8 @@ class _Arena:
             if pybullet.getCollisionShapeData(self.robot, link, physicsClientId=self.client)
         )
 
+        self.may_meet = np.array([[(a, b) in _SELF_PAIRS for b in self.solid] for a in self.solid])
+
     def enter(self, scene: Scene) -> int:
         """Put a scene's boxes and table around the robot; returns the table's body."""
         self._uses += 1
@@ -198,6 +200,7 @@ class _Run:
         self.arena = arena
         self.table = arena.enter(scene)
         self.boxes = {box.name: box for box in scene.objects}
+        self.names = tuple(self.boxes)
         self.body = dict(zip(self.boxes, arena.bodies[:-1], strict=True))
         self.table_half = np.array(scene.table.size) / 2
         self.bounds: dict[str, np.ndarray] = {}
@@ -379,28 +382,30 @@ class _Run:
 
     def _overlaps(self, gripped: str | None) -> None:
         """Record the deepest overlap in the present pose; `gripped` may touch the fingers."""
-        arena = self.arena
-        links = np.array([arena.bounds(arena.robot, link) for link in arena.solid])
-        boxes = np.array([self.bounds[name] for name in self.boxes])
-        names = list(self.boxes)
-        for i, j in np.argwhere(_touching(links, boxes)):
+        arena, names = self.arena, self.names
+        count = len(arena.solid)
+        bounds = np.array(
+            [arena.bounds(arena.robot, link) for link in arena.solid]
+            + [self.bounds[name] for name in names]
+        )
+        near = _touching(bounds[:count], bounds)
+        for i, j in np.argwhere(near[:, count:]):
             link, name = arena.solid[i], names[j]
             if name != gripped or link not in _FINGERS:
                 depth = -arena.distance(arena.robot, self.body[name], link)
                 self._record(depth, arena.names[link], name)
-        for i in np.flatnonzero(links[:, 0, 2] < 0):
+        for i, j in np.argwhere(near[:, :count] & arena.may_meet):
+            a, b = arena.solid[i], arena.solid[j]
+            depth = -arena.distance(arena.robot, arena.robot, a, b)
+            self._record(depth, arena.names[a], arena.names[b])
+        for i in np.flatnonzero(bounds[:count, 0, 2] < 0):
             if arena.solid[i] not in (_BASE, 0):
                 depth = -arena.distance(arena.robot, self.table, arena.solid[i])
                 self._record(depth, arena.names[arena.solid[i]], "table")
-        for a, b in _SELF_PAIRS:
-            i, j = arena.solid.index(a), arena.solid.index(b)
-            if _touching(links[i : i + 1], links[j : j + 1])[0, 0]:
-                depth = -arena.distance(arena.robot, arena.robot, a, b)
-                self._record(depth, arena.names[a], arena.names[b])
         if self.held is None:
             return
         mine = self.bounds[self.held]
-        for j in np.flatnonzero(_touching(mine[None], boxes)[0]):
+        for j in np.flatnonzero(_touching(mine[None], bounds[count:])[0]):
             if names[j] != self.held:
                 depth = -arena.distance(self.body[self.held], self.body[names[j]])
                 self._record(depth, self.held, names[j])

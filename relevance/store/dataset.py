@@ -329,13 +329,14 @@ class Dataset:
     # queries ----------------------------------------------------------------------------------
 
     def connect(
-        self, *, origin: bool = False, without: Collection[Path] = ()
+        self, *, origin: bool = False, without: Collection[Path] = (), memory: bool = False
     ) -> duckdb.DuckDBPyConnection:
         """DuckDB with a view per table and all of `schemas/views.sql`; paths are absolute.
 
         A table without files is an empty view. With `origin` the table views also have `file`
-        (within the dataset) and `row` (from 0); files in `without` are left out. Raises
-        DatasetError for a file that does not have the schema's columns.
+        (within the dataset) and `row` (from 0); files in `without` are left out. With `memory`
+        the tables are copied, for many queries on a small dataset. Raises DatasetError for a
+        file that does not have the schema's columns.
         """
         connection = duckdb.connect()
         for table in TABLES:
@@ -358,7 +359,7 @@ class Dataset:
                 if origin:
                     body += ", NULL::VARCHAR AS file, NULL::BIGINT AS row"
                 body += " WHERE false"
-            connection.execute(f"CREATE VIEW {table} AS SELECT {body}")
+            connection.execute(f"CREATE {'TABLE' if memory else 'VIEW'} {table} AS SELECT {body}")
         connection.execute((SCHEMAS / "views.sql").read_text())
         return connection
 

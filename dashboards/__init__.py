@@ -1,0 +1,1 @@
+"""The dashboard (`app.py`, a Streamlit script) and its SQL."""

@@ -1,0 +1,18 @@
+-- Planned goals of one split for the grid of scenes: the moved objects, and the scores of one
+-- checkpoint as a map from name to score.
+WITH scored AS (
+    SELECT
+        scene_id, predicate, subject, reference,
+        map_from_entries(list({'k': query, 'v': score} ORDER BY query)) AS scores
+    FROM predictions
+    WHERE checkpoint_id = $checkpoint_id AND split = $split
+    GROUP BY ALL
+)
+SELECT
+    p.plan_id, p.scene_id, p.shard, p.predicate, p.subject, p.reference,
+    p.status, p.reason, p.actions, p.moved, s.scores,
+    len(list_filter(p.moved, lambda name: name NOT IN (p.subject, p.reference))) AS blockers
+FROM plans AS p LEFT JOIN scored AS s USING (scene_id, predicate, subject, reference)
+WHERE p.split = $split AND p.predicate IN (SELECT unnest($predicates::VARCHAR[]))
+    AND p.status IN (SELECT unnest($statuses::VARCHAR[]))
+ORDER BY md5(p.plan_id);

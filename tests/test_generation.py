@@ -1,0 +1,422 @@
+"""Shards: which there are, that they are equal bytes however they are made, and resuming."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from relevance import generation
+from relevance.generation import (
+    Counts,
+    DatasetConfig,
+    ShardSpec,
+    generate_shard,
+    label_shard,
+    load_config,
+    prepare,
+    work,
+)
+from relevance.labels import stored_scene
+from relevance.sampling import SceneConfig, sample_goals, sample_scene
+from relevance.scene import FAMILIES, Predicate
+from relevance.store import SPLITS, Dataset, DatasetError
+
+CONFIG = DatasetConfig(
+    seed=3,
+    train=Counts(same_plane=3, on=2),
+    validation=Counts(same_plane=1),
+    test=Counts(same_plane=1, on=1),
+    scenes_per_shard=2,
+    goals_per_scene=1,
+    scene=SceneConfig(max_objects=6),
+    replay_share=0.3,
+)
+
+
+def make(root: Path, config: DatasetConfig = CONFIG) -> Path:
+    """Make a whole dataset in this process."""
+    for spec in prepare(root, config):
+        generate_shard(root, config, spec)
+        for predicate in spec.predicates:
+            label_shard(root, config, spec, predicate)
+    return root
+
+
+@cache
+def small_dataset() -> Path:
+    """A finished dataset of CONFIG, made once; copy it before you change it."""
+    return make(Path(tempfile.mkdtemp(prefix="relevance-test-")) / "dataset")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cleanup() -> Iterator[None]:
+    yield
+    if small_dataset.cache_info().currsize:
+        shutil.rmtree(small_dataset().parent)
+        small_dataset.cache_clear()
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(small_dataset(), tmp_path / "dataset"))
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """Every file that falls under the equal-bytes promise."""
+    return {
+        str(file.relative_to(root)): file.read_bytes()
+        for file in sorted(root.rglob("*"))
+        if file.is_file() and "timings" not in file.parts
+    }
+
+
+# which shards ----------------------------------------------------------------------------------
+
+counts = st.builds(Counts, same_plane=st.integers(0, 9), on=st.integers(0, 9))
+configs = st.builds(
+    DatasetConfig, train=counts, validation=counts, test=counts, scenes_per_shard=st.integers(1, 5)
+)
+
+
+@given(configs)
+def test_work_covers_every_scene_once(config: DatasetConfig) -> None:
+    specs = work(config)
+    for split in SPLITS:
+        mine = [spec for spec in specs if spec.split == split]
+        assert [spec.shard for spec in mine] == list(range(len(mine)))
+        indices = [i for spec in mine for i in range(spec.first, spec.first + spec.count)]
+        assert indices == list(range(len(indices)))
+        for family in FAMILIES:
+            scenes = sum(spec.count for spec in mine if spec.family == family)
+            assert scenes == config.counts(split).of(family)
+        assert all(1 <= spec.count <= config.scenes_per_shard for spec in mine)
+
+
+@given(configs, configs)
+def test_appending_never_renumbers(first: DatasetConfig, second: DatasetConfig) -> None:
+    before = work(first)
+    after = work(second, before)
+    assert [spec for spec in after if spec in before] == before
+    for split in SPLITS:
+        mine = [spec for spec in after if spec.split == split]
+        indices = sorted(i for s in mine for i in range(s.first, s.first + s.count))
+        assert indices == list(range(len(indices)))
+        for family in FAMILIES:
+            have = sum(spec.count for spec in mine if spec.family == family)
+            asked = (first.counts(split).of(family), second.counts(split).of(family))
+            assert have == max(asked)
+
+
+def test_a_shard_knows_its_predicates() -> None:
+    spec = ShardSpec(split="train", shard=0, family="on", first=0, count=1)
+    assert spec.predicates == (Predicate.ON,)
+    assert len(replace(spec, family="same-plane").predicates) == 4
+
+
+@pytest.mark.parametrize("preset", ["smoke", "demo", "laptop", "paper"])
+def test_presets(preset: str) -> None:
+    config = getattr(DatasetConfig, preset)()
+    for split in SPLITS:
+        assert min(config.counts(split).same_plane, config.counts(split).on) > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": -1}, "seed = -1: expected at least 0"),
+        ({"goals_per_scene": 0}, "goals_per_scene = 0: expected at least 1"),
+        ({"scenes_per_shard": 0}, "scenes_per_shard = 0"),
+        ({"replay_share": 1.5}, "replay_share = 1.5: expected 0 to 1"),
+        ({"policy": "guess"}, "policy = 'guess': expected one of found"),
+    ],
+)
+def test_impossible_settings(change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        DatasetConfig(**change)
+
+
+# dataset.json ----------------------------------------------------------------------------------
+
+
+def test_prepare_twice_and_more(tmp_path: Path) -> None:
+    specs = prepare(tmp_path, CONFIG)
+    before = (tmp_path / "dataset.json").read_bytes()
+    assert prepare(tmp_path, CONFIG) == specs
+    assert (tmp_path / "dataset.json").read_bytes() == before
+    assert load_config(Dataset.open(tmp_path)) == CONFIG
+    more = replace(CONFIG, train=Counts(same_plane=7, on=2))
+    grown = prepare(tmp_path, more)
+    assert [spec for spec in grown if spec in specs] == specs
+    assert sum(spec.count for spec in grown) == sum(spec.count for spec in specs) + 4
+    assert prepare(tmp_path, CONFIG) == grown, "asking for fewer keeps what is there"
+    stored = Dataset.open(tmp_path).description
+    assert stored["counts"]["train"] == {"same-plane": 7, "on": 2}
+    assert load_config(Dataset.open(tmp_path)) == more
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 4}, r"dataset.json: config.seed: .* made with 3, found 4; take another folder"),
+        ({"scene": SceneConfig(max_objects=7)}, r"config.scene.max_objects: .* with 6, found 7"),
+        ({"goals_per_scene": 2}, r"config.goals_per_scene: .* with 1, found 2; plan it anew"),
+        ({"replay_share": 0.0}, r"config.replay_share: .* with 0.3, found 0.0; plan it anew"),
+    ],
+)
+def test_other_settings_are_refused(tmp_path: Path, change: dict, message: str) -> None:
+    prepare(tmp_path, CONFIG)
+    with pytest.raises(DatasetError, match=message):
+        prepare(tmp_path, replace(CONFIG, **change))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"config": {"seed": "x"}}, r"dataset.json: config.seed: "),
+        ({"shards": [{"split": "train"}]}, r"dataset.json: shards.0.shard: "),
+    ],
+)
+def test_a_broken_description(tmp_path: Path, change: dict, message: str) -> None:
+    prepare(tmp_path, CONFIG)
+    file = tmp_path / "dataset.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
+    with pytest.raises(DatasetError, match=message):
+        prepare(tmp_path, CONFIG)
+    file.write_text("{}")
+    with pytest.raises(DatasetError, match=r"dataset.json: shards: expected there, found no such"):
+        prepare(tmp_path, CONFIG)
+
+
+# scenes and images -----------------------------------------------------------------------------
+
+
+def test_rows_say_how_to_draw_the_scene_again() -> None:
+    rows = Dataset.open(small_dataset()).read_rows("scenes")
+    assert len(rows) == 8
+    for row in rows:
+        settings = replace(CONFIG.scene, family=row["family"])
+        again = sample_scene(
+            settings,
+            seed=row["seed"],
+            index=row["index"],
+            split=row["split"],
+            attempt=row["attempt"],
+        )
+        assert again == stored_scene(row)
+        assert row["scene_id"] == stored_scene(row).id
+        assert row["n_objects"] == len(row["objects"])
+        assert all(0.25 <= box["visible_fraction"] <= 1 for box in row["objects"])
+        assert all(box["visible_pixels"] >= 60 for box in row["objects"])
+
+
+def test_images_belong_to_their_rows() -> None:
+    dataset = Dataset.open(small_dataset())
+    for split in SPLITS:
+        rows = dataset.read_rows("scenes", split=split)
+        samples = list(dataset.samples(split))
+        assert [sample.key for sample in samples] == [row["scene_id"] for row in rows]
+        for sample, row in zip(samples, rows, strict=True):
+            assert sample.scene == stored_scene(row)
+            pixels = [int((sample.mask == i + 1).sum()) for i in range(row["n_objects"])]
+            assert pixels == [box["visible_pixels"] for box in row["objects"]]
+            assert sample.views.shape == (row["n_objects"], 32, 32, 3)
+
+
+def test_settings_without_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(generation, "ATTEMPTS", 3)
+    tight = replace(CONFIG, scene=SceneConfig(min_objects=10, reach=(0.30, 0.34), tries=2))
+    spec = prepare(tmp_path, tight)[0]
+    with pytest.raises(DatasetError, match=r"scene 0 of train: no draw in 3 was accepted"):
+        generate_shard(tmp_path, tight, spec)
+    assert list(tmp_path.rglob("*.tar")) == list(tmp_path.rglob("*.tmp")) == []
+
+
+# equal bytes -----------------------------------------------------------------------------------
+
+
+def _one(arguments: tuple[Path, ShardSpec]) -> None:
+    root, spec = arguments
+    generate_shard(root, CONFIG, spec)
+    for predicate in reversed(spec.predicates):
+        label_shard(root, CONFIG, spec, predicate)
+
+
+def test_two_workers_give_the_bytes_of_one(tmp_path: Path) -> None:
+    specs = prepare(tmp_path, CONFIG)
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(max_workers=2, mp_context=spawn) as pool:
+        list(pool.map(_one, [(tmp_path, spec) for spec in reversed(specs)]))
+    one, two = contents(small_dataset()), contents(tmp_path)
+    assert one.keys() == two.keys()
+    assert [name for name in one if one[name] != two[name]] == []
+    assert len([name for name in one if name.startswith("labels/")]) == sum(
+        len(spec.predicates) for spec in specs
+    )
+
+
+def test_another_seed_gives_other_bytes(tmp_path: Path) -> None:
+    other = replace(CONFIG, seed=4)
+    spec = prepare(tmp_path, other)[0]
+    generate_shard(tmp_path, other, spec)
+    name = "scenes/split=train/shard-000000.parquet"
+    assert (tmp_path / name).read_bytes() != (small_dataset() / name).read_bytes()
+
+
+# resuming --------------------------------------------------------------------------------------
+
+
+@contextmanager
+def untouched(*files: Path) -> Iterator[None]:
+    before = [(file.stat().st_mtime_ns, file.stat().st_ino) for file in files]
+    yield
+    assert [(file.stat().st_mtime_ns, file.stat().st_ino) for file in files] == before
+
+
+def test_finished_shards_are_skipped(made: Path) -> None:
+    files = [file for file in made.rglob("*") if file.is_file()]
+    with untouched(*files):
+        for spec in prepare(made, CONFIG):
+            assert generate_shard(made, CONFIG, spec).skipped
+            for predicate in spec.predicates:
+                report = label_shard(made, CONFIG, spec, predicate)
+                assert report.skipped
+                assert report.rows > 0
+
+
+def test_labels_are_made_anew_from_stored_plans(made: Path) -> None:
+    dataset = Dataset.open(made)
+    before = contents(made)
+    labels = dataset.files("labels")
+    for file in labels:
+        file.unlink()
+    kept = [file for table in ("scenes", "plans", "timings") for file in dataset.files(table)]
+    with untouched(*kept):
+        make(made)
+    assert contents(made) == before
+
+
+def test_a_lost_shard_is_made_again(made: Path) -> None:
+    before = contents(made)
+    lost = ["scenes/split=train/shard-000001.parquet", "images/split=test/shard-000000.tar"]
+    lost.append("plans/predicate=on/split=test/shard-000001.parquet")
+    for name in lost:
+        (made / name).unlink()
+    make(made)
+    assert contents(made) == before
+
+
+def test_a_killed_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:
+    program = (
+        "import sys\nfrom pathlib import Path\nsys.path.insert(0, sys.argv[2])\n"
+        "from test_generation import CONFIG, prepare, generate_shard\n"
+        "root = Path(sys.argv[1])\n"
+        "for spec in prepare(root, CONFIG):\n"
+        "    def tell(done, of):\n"
+        "        print(spec.split, spec.shard, done, flush=True)\n"
+        "    generate_shard(root, CONFIG, spec, tell)\n"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path), str(Path(__file__).parent)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout is not None
+        for line in run.stdout:
+            if line == "train 1 1\n":  # the second shard is half made
+                run.send_signal(signal.SIGKILL)
+                break
+    dataset = Dataset.open(tmp_path)
+    assert dataset.shards("train") in ([0], [0, 1])  # the kill may come a shard late
+    for spec in prepare(tmp_path, CONFIG):
+        generate_shard(tmp_path, CONFIG, spec)
+    expected = contents(small_dataset())
+    for name, content in contents(tmp_path).items():
+        if not name.endswith(".tmp"):
+            assert content == expected[name], name
+    assert len(dataset.files("scenes")) == len(Dataset.open(small_dataset()).files("scenes"))
+
+
+def test_planning_anew_leaves_the_images(made: Path) -> None:
+    before = contents(made)
+    more = replace(CONFIG, goals_per_scene=2)
+    with pytest.raises(DatasetError, match="plan it anew"):
+        prepare(made, more)
+    spec = prepare(made, more, replan=True)[-1]
+    dataset = Dataset.open(made)
+    with untouched(*dataset.files("scenes"), *made.rglob("*.tar")):
+        assert generate_shard(made, more, spec).skipped
+        report = label_shard(made, more, spec, "on")
+    assert not report.skipped
+    assert report.rows > spec.count
+    name = f"plans/predicate=on/split=test/shard-{spec.shard:06d}.parquet"
+    assert (made / name).read_bytes() != before[name]
+
+
+# labels ----------------------------------------------------------------------------------------
+
+
+def test_plans_are_of_the_drawn_goals() -> None:
+    dataset = Dataset.open(small_dataset())
+    scenes = {row["scene_id"]: stored_scene(row) for row in dataset.read_rows("scenes")}
+    plans = dataset.read_rows("plans")
+    found = {(p["scene_id"], p["predicate"], p["subject"], p["reference"]) for p in plans}
+    expected = {
+        (scene.id, goal.predicate.value, goal.subject, goal.reference)
+        for scene in scenes.values()
+        for predicate in Predicate
+        if (predicate.family == "on") == any(box.on for box in scene.objects)
+        for goal in sample_goals(scene, predicate, CONFIG.goals_per_scene, seed=CONFIG.seed)
+    }
+    assert found == expected
+    assert len(plans) == len(expected)
+    assert {plan["status"] for plan in plans} <= {"solved", "infeasible", "limit"}
+    assert sum(plan["holds"] for plan in plans) >= len(plans) / 2
+    timed = {row["plan_id"] for row in dataset.read_rows("timings")}
+    assert timed == {plan["plan_id"] for plan in plans}
+
+
+def test_every_solved_test_plan_is_replayed() -> None:
+    plans = Dataset.open(small_dataset()).read_rows("plans", split="test", status="solved")
+    assert plans
+    assert all(plan["replay_ok"] is not None for plan in plans)
+    assert all(plan["replay_max_penetration"] is not None for plan in plans)
+
+
+def test_the_replayed_share_is_a_share() -> None:
+    ids = [f"scene{i}" for i in range(4000)]
+    drawn = sum(generation._chosen(name, "on(a, b)", 0.1) for name in ids)
+    assert 330 < drawn < 470
+    assert not any(generation._chosen(name, "on(a, b)", 0.0) for name in ids)
+    assert all(generation._chosen(name, "on(a, b)", 1.0) for name in ids)
+
+
+def test_labels_need_scenes_and_a_fitting_predicate(tmp_path: Path) -> None:
+    spec = prepare(tmp_path, CONFIG)[0]
+    with pytest.raises(DatasetError, match=r"shard-000000.parquet: does not exist, expected its"):
+        label_shard(tmp_path, CONFIG, spec, "behind")
+    with pytest.raises(ValueError, match="on: expected a predicate of family same-plane"):
+        label_shard(tmp_path, CONFIG, spec, "on")
+    with pytest.raises(DatasetError, match=r"no dataset\.json there"):
+        label_shard(tmp_path / "nowhere", CONFIG, spec, "behind")
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_progress_counts_to_the_end(tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    spec = prepare(tmp_path, CONFIG)[0]
+    generate_shard(tmp_path, CONFIG, spec, lambda done, of: seen.append((done, of)))
+    assert seen == [(1, 2), (2, 2)]
+    assert os.listdir(tmp_path / "images/split=train") == ["shard-000000.tar"]
