@@ -20,7 +20,6 @@ import streamlit as st
 from relevance.report.figures import read_evaluations, read_predictions, settings, summarise
 from relevance.report.gallery import outlined
 from relevance.report.plots import DASH, GROUPS, PAPER_ACCURACY, PREDICATES, seconds
-from relevance.scene import Predicate
 from relevance.store import SPLITS, Dataset, DatasetError, Sample
 
 SQL = Path(__file__).parent / "sql"
@@ -101,14 +100,25 @@ def main() -> None:
 
 def top(totals: Mapping[str, Any]) -> None:
     """The figures over the tabs."""
-    columns = st.columns(4)
-    columns[0].metric("Scenes", f"{totals['scenes']:,}")
-    columns[1].metric("Goals solved", _percent(totals["solved"]), f"of {totals['goals']:,}", "off")
-    columns[2].metric(
-        "Replays within 1 mm", _percent(totals["replay_ok"]), f"of {totals['replayed']:,}", "off"
-    )
     median = totals["median_seconds"]
-    columns[3].metric("Median planning time", DASH if median is None else seconds(median))
+    figures = (
+        ("Scenes", f"{totals['scenes']:,}", "all splits"),
+        ("Goals solved", _percent(totals["solved"]), f"of {totals['goals']:,}"),
+        ("Replays within 1 mm", _percent(totals["replay_ok"]), f"of {totals['replayed']:,}"),
+        (
+            "Median planning time",
+            DASH if median is None else seconds(median),
+            f"{totals['timed']:,} tasks",
+        ),
+    )
+    for column, figure in zip(st.columns(len(figures)), figures, strict=True):
+        show_figure(column, *figure)
+
+
+def show_figure(column: Any, label: str, value: str, note: str) -> None:
+    """One headline figure and what it rests on."""
+    column.metric(label, value)
+    column.caption(note)
 
 
 def show_labels(path: str, version: tuple[int, int], split: str) -> None:
@@ -155,11 +165,13 @@ def show_accuracy(
     columns = st.columns(len(GROUPS) * 2)
     for number, group in enumerate(g for g in GROUPS if g in found):
         a, paper = found[group], PAPER_ACCURACY[group]
-        columns[2 * number].metric(
-            f"Total, {group}", _percent(a.total), f"{100 * (a.total - a.base_rate):+.1f} to base"
-        )
-        columns[2 * number + 1].metric(
-            f"True relevant, {group}", _percent(a.true_relevant), f"paper {paper[0]:.0%}", "off"
+        note = f"base rate {_percent(a.base_rate)}, paper {paper[2]:.0%}; {a.n_tasks} tasks"
+        show_figure(columns[2 * number], f"Total, {group}", _percent(a.total), note)
+        show_figure(
+            columns[2 * number + 1],
+            f"True relevant, {group}",
+            _percent(a.true_relevant),
+            f"paper {paper[0]:.0%}; {round(a.share_relevant * a.n_rows)} relevant queries",
         )
     st.dataframe(
         [
@@ -205,12 +217,12 @@ def show_speed(path: str, version: tuple[int, int], checkpoint: str | None) -> N
     best = [c for c in found if c.group == "all" and c.beta == 0]
     for column, c in zip(st.columns(max(len(best), 2)), best, strict=False):
         shown = c.speedup_both if c.guide == "prune" else c.speedup
-        left_out = " left out" if c.guide == "prune" else ""
-        column.metric(
+        left_out = ", left out" if c.guide == "prune" else ""
+        show_figure(
+            column,
             f"{c.guide}, {c.search} search",
             f"{shown.value:.2f} x",
             f"{shown.low:.2f} to {shown.high:.2f}; {c.misses} of {c.n_solvable} missed{left_out}",
-            "off",
         )
     st.dataframe(
         rows,
@@ -238,7 +250,7 @@ def show_scenes(
     path: str, version: tuple[int, int], checkpoint: str | None, split: str, beta: float
 ) -> None:
     """Scenes of the split with their goals, the relevant objects outlined."""
-    one, two, three = st.columns([2, 2, 1])
+    one, two, three = st.columns([3, 2, 1])
     predicates = one.multiselect("Predicates", PREDICATES, list(PREDICATES), key="predicates")
     statuses = two.multiselect(
         "Status", ("solved", "infeasible", "limit"), ["solved"], key="statuses"
@@ -267,10 +279,11 @@ def show_scenes(
         f"{len(tasks)} tasks, page {page} of {pages}. S subject, R reference; green: relevant; "
         "dashed orange: kept, though irrelevant; dashed red: left out, though relevant."
     )
-    columns = st.columns(3, gap="medium")
-    for number, task in enumerate(shown):
-        with columns[number % 3].container(border=True):
-            show_task(samples[task["scene_id"]], task, beta)
+    for start in range(0, len(shown), 3):
+        row = zip(st.columns(3, gap="medium"), shown[start : start + 3], strict=False)
+        for column, task in row:
+            with column.container(border=True):
+                show_task(samples[task["scene_id"]], task, beta)
 
 
 def show_task(sample: Sample, task: Mapping[str, Any], beta: float) -> None:

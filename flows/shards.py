@@ -24,6 +24,8 @@ from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.context import FlowRunContext
 from prefect.events import emit_event
 from prefect.futures import PrefectFuture, as_completed
+from prefect.server.api.server import SubprocessASGIServer
+from prefect.settings import PREFECT_API_URL, get_current_settings, temporary_settings
 from prefect.task_runners import ProcessPoolTaskRunner, TaskRunner, ThreadPoolTaskRunner
 
 EVENT = "shards.written"
@@ -78,12 +80,27 @@ def one_by_one() -> TaskRunner[Any]:
 
 
 @contextmanager
+def one_server() -> Iterator[None]:
+    """Let worker processes talk to the server that this process has.
+
+    Without a server each process would start one of its own: seconds and memory for nothing.
+    """
+    if get_current_settings().api.url:
+        yield
+        return
+    server = SubprocessASGIServer()  # one object a process: the one that the flow itself uses
+    server.start()
+    with temporary_settings({PREFECT_API_URL: server.api_url}):
+        yield
+
+
+@contextmanager
 def _runner(max_workers: int | None) -> Iterator[TaskRunner[Any]]:
     """A fresh process pool, or the runner that the flow was given instead (threads, Dask, Ray)."""
     context = FlowRunContext.get()
     assert context is not None, "shards are run inside a flow"
     if isinstance(context.task_runner, ProcessPoolTaskRunner):
-        with process_pool(max_workers) as pool:
+        with one_server(), process_pool(max_workers) as pool:
             yield pool
     else:
         yield context.task_runner

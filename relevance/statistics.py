@@ -7,6 +7,7 @@ last poses fulfil its goal, a stored scene renders again to equal pixels).
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
 import tarfile
@@ -354,16 +355,16 @@ def _goals(dataset: Dataset, left_out: set[Path]) -> Iterator[Breach]:
         scenes_file = dataset.shard_path("scenes", split=keys["split"], shard=keys["shard"])
         if file in left_out or not scenes_file.is_file():
             continue
-        scenes = {row["scene_id"]: row for row in dataset.read_file(scenes_file).to_pylist()}
+        scenes = dict(_possible(dataset.read_file(scenes_file).to_pylist()))
         for row, plan in enumerate(dataset.read_file(file).to_pylist()):
             if not plan["holds"] or plan["scene_id"] not in scenes:
                 continue
+            scene = scenes[plan["scene_id"]]
             final = {
                 item["name"]: Pose(position=tuple(item["position"]), yaw=item["yaw"], on=item["on"])
                 for item in plan["final"]
             }
             try:
-                scene = stored_scene(scenes[plan["scene_id"]])
                 goal = scene.goal(f"{plan['predicate']}({plan['subject']}, {plan['reference']})")
             except SceneError as error:
                 yield Breach(
@@ -378,6 +379,12 @@ def _goals(dataset: Dataset, left_out: set[Path]) -> Iterator[Breach]:
                     column="final",
                     message=f"expected {goal} to be true of the last poses, found that it is not",
                 )
+
+
+def _possible(rows: list[dict[str, Any]]) -> Iterator[tuple[str, Scene]]:
+    for row in rows:
+        with contextlib.suppress(SceneError):  # reported with the scenes
+            yield row["scene_id"], stored_scene(row)
 
 
 def _same_shard(dataset: Dataset, a: Path, b: Path) -> bool:

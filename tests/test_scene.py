@@ -110,7 +110,7 @@ def test_round_trip_is_exact(x, y, yaw, size):
         (raw(colour="red"), "colour", "Unexpected keyword argument"),
         (changed(0, weight=3), "objects.0.weight", "Unexpected keyword argument"),
         (raw(objects=[]), "objects", "at least 1 item"),
-        (raw(objects=None), "objects", "valid tuple"),
+        (raw(objects=None), "objects", "valid array"),
         ({"id": "s1"}, "objects", "required"),
         (changed(1, size=[0.06, 0.05]), "objects.1.size.2", "required"),
         (changed(1, size=[0.06, 0.05, -0.1]), "objects.1.size.2", "greater than 0"),

@@ -215,6 +215,21 @@ def test_visible_fraction_from_odd_cameras(renderer, eye):
         assert mine.visible_fraction[i] == pytest.approx(mine.visible_pixels[i] / max(alone, 1))
 
 
+def test_visible_fraction_of_a_box_partly_behind_the_camera(renderer):
+    camera = Camera(eye=(0.0, 0.0, 0.05), target=(0.3, 0.0, 0.05), fov=90)
+    long = box("red", 0.05, 0.1, size=(0.3, 0.04, 0.1))
+    small = box("blue", 0.12, 0.05, size=(0.03, 0.03, 0.05))
+    scene = Scene(objects=(long, small), camera=camera)
+    mine = renderer.render(scene)
+    for i, item in enumerate(scene.objects):
+        reference = Reference(scene, only=item.name)
+        alone = int((reference.picture()[1] >= 0).sum())
+        reference.close()
+        assert alone > 500
+        assert mine.visible_fraction[i] == pytest.approx(mine.visible_pixels[i] / alone)
+    assert mine.visible_fraction[0] < 1
+
+
 def test_image_left_is_robot_left(renderer):
     scene = Scene(objects=(box("red", 0.0, 0.2), box("blue", 0.0, -0.2), box("green", 0.25, 0.0)))
     mask = renderer.render(scene).mask

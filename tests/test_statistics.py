@@ -48,8 +48,8 @@ def rewrite(dataset: Dataset, table: str, change: Callable[[list[dict]], object]
     dataset.write_rows(table, rows, made_by=made_by, **where)
 
 
-def found(dataset: Dataset, **how: bool) -> list[Breach]:
-    return check(dataset.path, **{"render": False, **how})
+def found(dataset: Dataset, *, render: bool = False) -> list[Breach]:
+    return check(dataset.path, render=render)
 
 
 # a good dataset --------------------------------------------------------------------------------

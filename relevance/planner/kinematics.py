@@ -222,10 +222,7 @@ def hand_down(target, base, lower, upper, q):
     q[5] = q[1] - q[3]
     turn = math.pi / 2 + q[0] - (target[3] - base[3])
     q[6] = math.pi / 4 + turn - math.pi * math.floor(turn / math.pi + 0.5)
-    for i in range(7):
-        if q[i] < lower[i] or q[i] > upper[i]:
-            return False
-    return True
+    return (q >= lower).all() and (q <= upper).all()
 
 
 @njit(cache=True)

@@ -174,7 +174,7 @@ class Problem:
         self.seconds.pose += time.process_time() - began
         if status == UNDECIDED:
             self.undecided = True
-        return tuple(float(value) for value in pose) if status == FOUND else None
+        return (float(pose[0]), float(pose[1]), float(pose[2])) if status == FOUND else None
 
     def place_all(self, order: tuple[str, ...], grasp: Grasp) -> list[Placement] | None:
         """Poses for every moved box: first the subject's, then the others' around it.

@@ -173,7 +173,7 @@ class _Search:
         if not self.reason:
             self.reason = f"no plan of up to {self.config.max_actions} actions"
             try:
-                found = self._levels()
+                found = self._plans()
             except _Limit:
                 status, self.reason = "limit", f"node limit {self.config.node_limit} reached"
         problem.seconds.total = time.process_time() - began
@@ -206,36 +206,54 @@ class _Search:
     def _hopeless(self) -> str:
         """Why no sequence can work even if everything else were gone; empty if one might."""
         problem, goal = self.problem, self.problem.goal
-        subject, reference = problem.boxes[goal.subject], problem.boxes[goal.reference]
         if not problem.grasps[goal.subject]:
-            return f"{subject.name} cannot be grasped: too wide for the hand or out of reach"
-        others = frozenset(problem.boxes) - {subject.name, reference.name}
-        movable = bool(problem.grasps[reference.name]) and self.config.max_actions >= 4
-        if not movable and all(
-            problem.goal_pose(others, grasp, reference) is None
-            for grasp in problem.grasps[subject.name]
-        ):
+            return f"{goal.subject} cannot be grasped: too wide for the hand or out of reach"
+        if not (self._within_reach() or self._reference_moves()):
             return "the goal region is out of reach, off the table or too tight for the hand"
         return ""
+
+    def _within_reach(self) -> bool:
+        """Whether the goal region has room for the subject where the reference stands."""
+        problem, goal = self.problem, self.problem.goal
+        others = frozenset(problem.boxes) - {goal.subject, goal.reference}
+        return any(
+            problem.goal_pose(others, grasp, problem.boxes[goal.reference]) is not None
+            for grasp in problem.grasps[goal.subject]
+        )
+
+    def _reference_moves(self) -> bool:
+        reference = self.problem.goal.reference
+        return self.config.max_actions >= 4 and bool(self.problem.grasps[reference])
 
     def _visit(self) -> None:
         self.problem.counts.nodes += 1
         if self.problem.counts.nodes > self.config.node_limit:
             raise _Limit
 
-    def _levels(self) -> list[Motion]:
+    def _plans(self) -> list[Motion]:
+        """All plans of the first level that has one.
+
+        The reference is a landmark: sequences that move it count only when no other does it.
+        """
+        reference, found = self.problem.goal.reference, []
+        if self._within_reach():
+            found = self._levels([name for name in self.order if name != reference], frozenset())
+        if not found and self._reference_moves():
+            found = self._levels(self.order, frozenset({reference}))
+        return found
+
+    def _levels(self, movable: list[str], required: frozenset[str]) -> list[Motion]:
         subject = self.problem.goal.subject
         frontier: list[tuple[str, ...]] = [()]
         for _ in range(self.config.max_actions // 2):
             found, following = [], []
             for prefix in frontier:
-                self._visit()
-                motion = self._finish(prefix)
+                motion = self._finish(prefix) if required <= set(prefix) else None
                 if motion is not None:
                     found.append(motion)
                     if self.scores is not None:
                         return found
-                for name in self.order:
+                for name in movable:
                     if name == subject or name in prefix:
                         continue
                     self._visit()
@@ -250,6 +268,7 @@ class _Search:
     def _finish(self, prefix: tuple[str, ...]) -> Motion | None:
         """Pick the subject now and place it at the goal: all bounds in turn."""
         problem, goal = self.problem, self.problem.goal
+        self._visit()
         gone = frozenset(prefix)
         if not logic.goal_blockers(problem.scene, goal) <= gone:
             return None

@@ -132,7 +132,7 @@ class Renderer:
         if scene.light.shadow:
             _shade_boxes(image, mask, scene)
         visible = np.bincount(mask.ravel(), minlength=len(bodies) + 1)[1:]
-        alone = np.array([self._pixels_alone(box, scene) for box in scene.objects])
+        alone = np.array([self._pixels_alone(i, bodies, scene) for i in range(len(bodies))])
         return Rendering(
             image=image,
             mask=mask,
@@ -232,32 +232,21 @@ class Renderer:
             self._table_colors[key] = (_pack(lit), _pack(shadowed))
         return self._table_colors[key]
 
-    def _pixels_alone(self, box: Box, scene: Scene) -> int:
-        """How many pixels of the image the box covers when nothing hides it."""
+    def _pixels_alone(self, i: int, bodies: Sequence[int], scene: Scene) -> int:
+        """How many pixels of the image object i covers when nothing hides it."""
         camera = scene.camera
-        corners, depth = project(camera, vertices(box))
+        corners, depth = project(camera, vertices(scene.objects[i]))
         if (depth > camera.near).all():
             rows, columns, x, y = _window(corners, camera)
             return int(_inside(_hull(corners), x, y).sum()) if rows and columns else 0
         # Partly behind the camera, the silhouette is not the hull of the corners: look.
-        others = [
-            pybullet.getBodyUniqueId(k, physicsClientId=self._client)
-            for k in range(pybullet.getNumBodies(physicsClientId=self._client))
-        ]
-        poses = [
-            pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
-            for body in others
-        ]
-        mine = others[[b.name for b in scene.objects].index(box.name)]
-        for body in others:
-            if body != mine:
-                self._put(body, (0.0, 0.0, -1e6), 0.0)
+        for j, body in enumerate(bodies):
+            if j != i:
+                self._put(body, _PARKED, 0.0)
         _, segments = self._picture(camera, scene.light)
-        for body, (position, orientation) in zip(others, poses, strict=True):
-            pybullet.resetBasePositionAndOrientation(
-                body, position, orientation, physicsClientId=self._client
-            )
-        return int((segments == mine).sum())
+        for body, box in zip(bodies, scene.objects, strict=True):
+            self._put(body, box.position, box.yaw)
+        return int((segments == bodies[i]).sum())
 
 
 def rejects(rendering: Rendering) -> str | None:
@@ -392,7 +381,8 @@ def _ground(camera: Camera, table: Table) -> tuple[np.ndarray, np.ndarray, np.nd
         y = camera.eye[1] + scale * rays[..., 1]
         half_x, half_y = table.size[0] / 2, table.size[1] / 2
         on_table = (scale > 0) & (np.abs(x) <= half_x) & (np.abs(y) <= half_y)
-    return on_table, x, y
+    # Rays that miss the plane have no point; nobody asks for one off the table.
+    return on_table, np.where(on_table, x, 0.0), np.where(on_table, y, 0.0)
 
 
 def _window(

@@ -46,8 +46,8 @@ class Native:
             self._entry = getattr(library, function.name())
         else:
             buffer, run = function.buffer()
-            buffer.set_arg(0, memoryview(self.x))
-            buffer.set_res(0, memoryview(self.y))
+            buffer.set_arg(0, self.x.data)
+            buffer.set_res(0, self.y.data)
             self._keep = buffer
             self._entry = _ENTRY(lambda *_: run() or 0)
         address = ctypes.cast(self._entry, ctypes.c_void_p).value
@@ -108,4 +108,4 @@ def _enter(typingctx, entry, arg, res, iw, w):
 @njit(cache=True)
 def call(handle):
     """Run the function behind a `Native.handle`."""
-    return _enter(handle[0], handle[1], handle[2], handle[3], handle[4])
+    return _enter(handle[0], handle[1], handle[2], handle[3], handle[4])  # pyright: ignore[reportCallIssue]

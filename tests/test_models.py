@@ -1,0 +1,310 @@
+"""Models: shared encoding equals the naive one, geometry, loss, and what each score may see."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from relevance import models
+from relevance.models import (
+    ANGLES,
+    GEOMETRY,
+    STRIDE,
+    Encoding,
+    ModelConfig,
+    RelevanceModel,
+    half_extents,
+    mirrored,
+    relevance_loss,
+    vit_paper,
+    vit_small,
+)
+from relevance.sampling import project
+from relevance.scene import Box, Camera, Predicate
+
+SMALL = {
+    "glimpse": ModelConfig(body="glimpse", width=32, heads=2, layers=2, channels=8),
+    "vit": ModelConfig(body="vit", width=32, heads=2, layers=2, hidden=24),
+}
+BODIES = pytest.mark.parametrize("body", list(SMALL))
+
+
+def model(body: str) -> RelevanceModel:
+    torch.manual_seed(1)
+    made = RelevanceModel(SMALL[body])
+    with torch.no_grad():  # away from zero, so that no term hides
+        for weight in made.parameters():
+            weight += 0.05 * torch.randn_like(weight)
+    return made.eval()
+
+
+def pictures(batch: int = 2, objects: int = 5) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(2)
+    image = torch.randint(0, 256, (batch, 3, 192, 320), dtype=torch.uint8, generator=generator)
+    views = torch.randint(
+        0, 256, (batch, objects, 3, 32, 32), dtype=torch.uint8, generator=generator
+    )
+    return image, views
+
+
+GOALS = torch.tensor([[[0, 1], [3, 2], [4, 0]], [[2, 4], [1, 0], [0, 3]]])
+
+
+@torch.inference_mode()
+def test_vit_shared_encoding_equals_one_encoding_a_query() -> None:
+    """The paper encodes subject, reference and query anew for every query."""
+    vit = model("vit")
+    image, views = pictures()
+    encoding = vit.encode(image, views)
+    for predicate in Predicate:
+        shared = vit.decode(encoding, predicate, GOALS)
+        for b in range(2):
+            for g in range(3):
+                for query in range(5):
+                    trio = [*GOALS[b, g].tolist(), query]
+                    alone = vit.encode(image[b : b + 1], views[b : b + 1, trio])
+                    score = vit.decode(alone, predicate, torch.tensor([[[0, 1]]]))[0, 0, 2]
+                    assert abs(score - shared[b, g, query]) < 1e-5
+
+
+@torch.inference_mode()
+def test_glimpse_shared_encoding_equals_one_encoding_a_goal() -> None:
+    glimpse = model("glimpse")
+    image, views = pictures()
+    encoding = glimpse.encode(image, views)
+    for predicate in Predicate:
+        shared = glimpse.decode(encoding, predicate, GOALS)
+        for b in range(2):
+            for g in range(3):
+                alone = glimpse.encode(image[b : b + 1], views[b : b + 1])
+                score = glimpse.decode(alone, predicate, GOALS[b : b + 1, g : g + 1])
+                torch.testing.assert_close(score[0, 0], shared[b, g], atol=1e-5, rtol=0)
+
+
+@BODIES
+@torch.inference_mode()
+def test_padding_changes_nothing(body: str) -> None:
+    network = model(body)
+    image, views = pictures()
+    padded = torch.cat([views, torch.full_like(views[:, :3], 200)], dim=1)
+    present = torch.arange(8).expand(2, -1) < 5
+    plain = network.decode(network.encode(image, views), "behind", GOALS)
+    wide = network.decode(network.encode(image, padded, present), "behind", GOALS)
+    torch.testing.assert_close(wide[..., :5], plain, atol=1e-5, rtol=0)
+
+
+@BODIES
+@torch.inference_mode()
+def test_order_of_objects_only_reorders_scores(body: str) -> None:
+    network = model(body)
+    image, views = pictures()
+    order = torch.tensor([3, 0, 4, 2, 1])
+    where = order.argsort()
+    plain = network.decode(network.encode(image, views), "on", GOALS)
+    shuffled = network.decode(network.encode(image, views[:, order]), "on", where[GOALS])
+    torch.testing.assert_close(shuffled, plain[..., order], atol=1e-5, rtol=0)
+
+
+@torch.inference_mode()
+def test_vit_tokens_do_not_see_other_objects() -> None:
+    vit = model("vit")
+    image, views = pictures()
+    other = views.clone()
+    other[:, 1] = 255 - other[:, 1]
+    before, after = vit.encode(image, views).tokens, vit.encode(image, other).tokens
+    torch.testing.assert_close(before[:, [0, 2, 3, 4]], after[:, [0, 2, 3, 4]], atol=1e-6, rtol=0)
+    assert (before[:, 1] - after[:, 1]).abs().max() > 1e-3
+    darker = vit.encode(image // 2, views).tokens
+    assert (before - darker).abs().amax(-1).min() > 1e-4, "every token must see the image"
+
+
+@BODIES
+def test_every_predicate_has_a_head_of_its_own(body: str) -> None:
+    network = model(body)
+    encoding = network.encode(*pictures())
+    network.decode(encoding, Predicate.BEHIND, GOALS).sum().backward()
+    heads = network.body.heads if body == "glimpse" else network.body.extractors
+    assert isinstance(heads, torch.nn.ModuleDict)
+    moved = {
+        name for name, head in heads.items() if any(w.grad is not None for w in head.parameters())
+    }
+    assert moved == {"behind"}
+    assert set(heads) == {predicate.value for predicate in Predicate}
+
+
+@BODIES
+@torch.inference_mode()
+def test_subject_and_reference_have_different_roles(body: str) -> None:
+    network = model(body)
+    encoding = network.encode(*pictures())
+    there = network.decode(encoding, "on", GOALS)
+    back = network.decode(encoding, "on", GOALS.flip(-1))
+    assert (there - back).abs().max() > 1e-3
+
+
+@BODIES
+def test_arrays_of_one_scene_score_as_tensors_do(body: str) -> None:
+    network = model(body)
+    image, views = pictures(batch=1)
+    encoding = network.encode_scene(
+        image[0].permute(1, 2, 0).numpy(), views[0].permute(0, 2, 3, 1).numpy()
+    )
+    goals = [(Predicate.ON, 0, 1), (Predicate.BEHIND, 3, 2), (Predicate.ON, 4, 0)]
+    scores = network.score_goals(encoding, goals)
+    assert scores.shape == (3, 5)
+    for row, (predicate, subject, reference) in zip(scores, goals, strict=True):
+        with torch.inference_mode():
+            pair = torch.tensor([[[subject, reference]]])
+            expected = network.decode(network.encode(image, views), predicate, pair)[0, 0]
+        np.testing.assert_allclose(row, expected.numpy(), atol=1e-5)
+
+
+def test_loss_by_hand() -> None:
+    scores = torch.tensor([2.0, -1.0, 0.5, 9.0])
+    relevant = torch.tensor([True, True, False, True])
+    mask = torch.tensor([True, True, True, False])
+    p = [1 / (1 + math.exp(-s)) for s in (2.0, -1.0, 0.5)]
+    by_hand = -(0.86 * math.log(p[0]) + 0.86 * math.log(p[1]) + 0.14 * math.log(1 - p[2])) / 3
+    assert float(relevance_loss(scores, relevant, mask, 0.86)) == pytest.approx(by_hand, abs=1e-6)
+    # missing a relevant object costs more than keeping an irrelevant one
+    missed = relevance_loss(torch.tensor([-1.0]), torch.ones(1), torch.ones(1), 0.86)
+    kept = relevance_loss(torch.tensor([1.0]), torch.zeros(1), torch.ones(1), 0.86)
+    assert float(missed / kept) == pytest.approx(0.86 / 0.14, rel=1e-5)
+
+
+def test_loss_of_nothing_is_zero_and_of_extreme_scores_finite() -> None:
+    scores = torch.tensor([400.0, -400.0], requires_grad=True)
+    assert relevance_loss(scores, torch.zeros(2), torch.zeros(2), 0.7).item() == 0.0
+    loss = relevance_loss(scores, torch.tensor([0.0, 1.0]), torch.ones(2), 0.7)
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert scores.grad is not None
+    assert torch.isfinite(scores.grad).all()
+
+
+@given(
+    x=st.floats(0.04, 0.12),
+    y=st.floats(0.04, 0.12),
+    yaw=st.floats(-math.pi, math.pi),
+)
+def test_half_extents_are_those_of_the_corners(x: float, y: float, yaw: float) -> None:
+    box = Box(name="a", size=(x, y, 0.1), position=(0, 0, 0.05), yaw=yaw, color=(1, 0, 0))
+    found = half_extents(*(torch.tensor(v, dtype=torch.float64) for v in (x, y, yaw)))
+    angles = np.arange(ANGLES) * math.pi / ANGLES
+    axes = np.stack([np.cos(angles), np.sin(angles)])
+    np.testing.assert_allclose(found.numpy(), (box.corners() @ axes).max(0), atol=1e-9)
+
+
+@settings(deadline=None)
+@given(x=st.floats(-0.15, 0.25), y=st.floats(-0.3, 0.3))
+def test_sight_lines_invert_the_projection(x: float, y: float) -> None:
+    camera = Camera()
+    pixel, _ = project(camera, np.array([x, y, models._GROUND]))
+    uv = pixel / np.array([camera.width, camera.height]) * 2 - 1
+    found = models._on_the_ground(torch.tensor(uv, dtype=torch.float32), camera)
+    np.testing.assert_allclose(found.numpy() * models.DECIMETRE, [x, y], atol=1e-4)
+
+
+def test_sight_lines_of_a_camera_that_looks_straight_down() -> None:
+    camera = Camera(eye=(0.1, 0.0, 0.9), target=(0.1, 0.0, 0.0))
+    pixel, _ = project(camera, np.array([0.15, -0.1, models._GROUND]))
+    uv = pixel / np.array([camera.width, camera.height]) * 2 - 1
+    found = models._on_the_ground(torch.tensor(uv, dtype=torch.float32), camera)
+    np.testing.assert_allclose(found.numpy() * models.DECIMETRE, [0.15, -0.1], atol=1e-4)
+
+
+def test_soft_argmax_and_window_point_at_the_same_pixels() -> None:
+    """A bright square in the image must be in the middle of the window around its centre."""
+    body = model("glimpse").body
+    assert isinstance(body, models.GlimpseBody)
+    image = torch.full((1, 3, 192, 320), 0.5)
+    image[..., 80:92, 200:212] = 1.0  # centre at (206, 86)
+    where = torch.zeros(1, 1, 48 * 80)
+    cells = torch.zeros(48, 80)
+    cells[80 // STRIDE : 92 // STRIDE, 200 // STRIDE : 212 // STRIDE] = 1
+    where[0, 0] = cells.flatten() / cells.sum()
+    centre = where @ body.cells_P2
+    expected = torch.tensor([206 / 320, 86 / 192]) * 2 - 1
+    torch.testing.assert_close(centre[0, 0], expected, atol=1e-6, rtol=0)
+    window = body._window(image, where, centre)[0]
+    for channel in (window[0], window[3]):
+        weight = channel / channel.sum()
+        middle = (weight.sum(0) * torch.arange(32)).sum(), (weight.sum(1) * torch.arange(32)).sum()
+        assert [float(m) for m in middle] == pytest.approx([15.5, 15.5], abs=0.1)
+        assert channel[15, 15] > 0.45
+        assert channel[2, 2] == 0
+
+
+def geometry(position: torch.Tensor, size: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:
+    return torch.cat([position, size, half_extents(size[..., 0], size[..., 1], yaw)], dim=-1)
+
+
+def test_mirror_is_the_geometry_of_the_mirrored_boxes() -> None:
+    generator = torch.Generator().manual_seed(3)
+    position, size = (torch.rand(1, 6, 3, generator=generator) for _ in range(2))
+    yaw = torch.rand(1, 6, generator=generator) * 3
+    flipped = geometry(position * torch.tensor([1.0, -1.0, 1.0]), size, -yaw)
+    plain = geometry(position, size, yaw)
+    torch.testing.assert_close(mirrored(plain), flipped, atol=1e-6, rtol=0)
+    torch.testing.assert_close(mirrored(mirrored(plain)), plain)
+
+
+@pytest.mark.parametrize("predicate", [p for p in Predicate if p.direction])
+def test_goal_axes_turn_with_the_predicate(predicate: Predicate) -> None:
+    """Turning the table by the angle between two predicates shows the heads the same thing."""
+    generator = torch.Generator().manual_seed(4)
+    position, size = (torch.rand(1, 5, 3, generator=generator) for _ in range(2))
+    yaw = torch.rand(1, 5, generator=generator) * 3
+    u = predicate.direction
+    assert u is not None
+    turn = math.atan2(u[1], u[0])  # from `behind`, whose direction is +x
+    c, s = math.cos(turn), math.sin(turn)
+    turned = position @ torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    goals = torch.tensor([[[0, 1], [4, 2]]])
+    plain = models._goal_features(geometry(position, size, yaw), Predicate.BEHIND, goals)
+    other = models._goal_features(geometry(turned, size, yaw + turn), predicate, goals)
+    torch.testing.assert_close(other, plain, atol=1e-5, rtol=0)
+    assert plain.shape == (1, 2, 5, models._GOAL_FEATURES)
+
+
+def test_glimpse_reads_its_geometry() -> None:
+    """Scores depend on the estimated geometry, so its loss teaches the heads what they use."""
+    glimpse = model("glimpse")
+    encoding = glimpse.encode(*pictures())
+    assert encoding.geometry is not None
+    assert encoding.geometry.shape == (2, 5, GEOMETRY)
+    moved = Encoding(
+        tokens=encoding.tokens, present=encoding.present, geometry=encoding.geometry + 1.0
+    )
+    with torch.no_grad():
+        difference = glimpse.decode(encoding, "on", GOALS) - glimpse.decode(moved, "on", GOALS)
+    assert difference.abs().max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"body": "resnet"}, "body is 'resnet', expected one of glimpse, vit"),
+        ({"width": 30}, "width is 30, expected a multiple of heads 4"),
+        ({"layers": 0}, "layers is 0, expected at least 1"),
+        ({"camera": Camera(width=300)}, "image is 300x192, expected multiples of 32"),
+    ],
+)
+def test_config_refuses(change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ModelConfig(**change)
+
+
+def test_config_survives_plain_values() -> None:
+    for config in (ModelConfig(), vit_small(), vit_paper()):
+        assert ModelConfig.from_dict(config.to_dict()) == config
+
+
+def test_image_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match="image is 64x64, expected 320x192"):
+        model("vit").encode(torch.zeros(1, 3, 64, 64), torch.zeros(1, 1, 3, 32, 32))

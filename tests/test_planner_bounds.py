@@ -1,0 +1,290 @@
+"""Kinematics against pybullet, gradients against finite differences, pose bound against a grid."""
+
+import math
+
+import numpy as np
+import pybullet
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from relevance.planner import keyframes, path, placement
+from relevance.planner.kernels import native
+from relevance.planner.kernels.boxes import banded_solve, rectangle_gap, separation
+from relevance.planner.kernels.native import call
+from relevance.planner.kinematics import ARM, FRAME, LINKS, hand_down, panda, reach_interval
+from relevance.planner.placement import FOUND, NONE
+from relevance.scene import Box
+from relevance.simulation import panda_urdf
+
+BASE = np.array([-0.48, 0.0, 0.0, 0.0])
+
+
+def frames_at(q, base=BASE):
+    arm = panda()
+    arm.frames.x[:] = np.r_[q, base]
+    call(arm.frames.handle)
+    return arm.frames.y.copy().reshape(len(LINKS), FRAME)
+
+
+def random_q(rng):
+    arm = panda()
+    return rng.uniform(arm.lower, arm.upper)
+
+
+def test_forward_kinematics_equals_pybullet():
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        base = np.array([-0.4, 0.1, 0.05, 0.7])
+        turn = pybullet.getQuaternionFromEuler([0, 0, base[3]])
+        robot = pybullet.loadURDF(
+            str(panda_urdf()), base[:3].tolist(), turn, useFixedBase=True, physicsClientId=client
+        )
+        joints = [pybullet.getJointInfo(robot, j, client) for j in range(12)]
+        index = {joint[12].decode(): joint[0] for joint in joints}
+        rng = np.random.default_rng(0)
+        for _ in range(50):
+            q = random_q(rng)
+            for i in range(ARM):
+                pybullet.resetJointState(robot, i, q[i], physicsClientId=client)
+            ours = frames_at(q, base)
+            for k, link in enumerate(LINKS):
+                state = pybullet.getLinkState(
+                    robot, index[link], computeForwardKinematics=True, physicsClientId=client
+                )
+                R = np.array(pybullet.getMatrixFromQuaternion(state[5]))
+                np.testing.assert_allclose(ours[k, :3], state[4], atol=1e-6)
+                np.testing.assert_allclose(ours[k, 3:12], R, atol=1e-6)
+    finally:
+        pybullet.disconnect(client)
+
+
+def test_joint_limits_are_those_of_the_urdf():
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        robot = pybullet.loadURDF(str(panda_urdf()), physicsClientId=client)
+        joints = [pybullet.getJointInfo(robot, j, client) for j in range(ARM)]
+    finally:
+        pybullet.disconnect(client)
+    arm = panda()
+    np.testing.assert_allclose(arm.lower, [joint[8] for joint in joints])
+    np.testing.assert_allclose(arm.upper, [joint[9] for joint in joints])
+    np.testing.assert_allclose(arm.velocity, [joint[11] for joint in joints])
+
+
+def test_frame_jacobians_equal_finite_differences():
+    rng, h = np.random.default_rng(1), 1e-6
+    for _ in range(10):
+        q = random_q(rng)
+        at = frames_at(q)
+        for i in range(ARM):
+            step = h * np.eye(ARM)[i]
+            change = (frames_at(q + step) - frames_at(q - step)) / (2 * h)
+            for k in range(len(LINKS)):
+                np.testing.assert_allclose(
+                    at[k, 12:33].reshape(3, 7)[:, i], change[k, :3], atol=1e-6
+                )
+                w = at[k, 33:54].reshape(3, 7)[:, i]
+                R = at[k, 3:12].reshape(3, 3)
+                spin = np.cross(w, R, axisb=0, axisc=0)
+                np.testing.assert_allclose(spin.ravel(), change[k, 3:12], atol=1e-6)
+
+
+def test_grasp_jacobians_equal_finite_differences():
+    arm, rng, h = panda(), np.random.default_rng(2), 1e-6
+
+    def residual(x):
+        arm.grasp.x[:] = x
+        call(arm.grasp.handle)
+        return arm.grasp.y.copy()
+
+    for _ in range(10):
+        x = np.r_[random_q(rng), BASE, rng.uniform(-0.5, 0.5, 4)]
+        y = residual(x)
+        J = np.hstack([y[6:48].reshape(6, 7), y[48:72].reshape(6, 4)])
+        for column, i in enumerate([*range(7), *range(11, 15)]):
+            step = h * np.eye(len(x))[i]
+            change = (residual(x + step)[:6] - residual(x - step)[:6]) / (2 * h)
+            np.testing.assert_allclose(J[:, column], change, atol=1e-6)
+
+
+def test_hand_down_solves_the_grasp_exactly():
+    arm, rng, q, reached = panda(), np.random.default_rng(3), np.zeros(7), 0
+    for _ in range(300):
+        target = np.array([rng.uniform(-0.3, 0.3), rng.uniform(-0.5, 0.5), rng.uniform(0.1, 0.4),
+                           rng.uniform(-4, 4)])  # fmt: skip
+        if not hand_down(target, BASE, arm.lower, arm.upper, q):
+            continue
+        reached += 1
+        arm.grasp.x[:] = np.r_[q, BASE, target]
+        call(arm.grasp.handle)
+        assert np.abs(arm.grasp.y[:6]).max() < 1e-9
+        assert frames_at(q)[2, 3:12].reshape(3, 3)[2, 2] < -0.999, "the hand points down"
+    assert reached > 200
+
+
+def test_reach_interval_is_what_hand_down_reaches():
+    arm, q = panda(), np.zeros(7)
+    near, far = reach_interval(0.15, BASE, arm.lower, arm.upper)
+    assert 0.15 < near < 0.35 < 0.7 < far < 0.9
+    for r, expected in ((far - 0.003, True), (far + 0.003, False), (near + 0.003, True)):
+        target = np.array([BASE[0] + r, 0.0, 0.15, 0.3])
+        assert hand_down(target, BASE, arm.lower, arm.upper, q) is expected
+
+
+def test_interpreted_kinematics_equal_compiled(monkeypatch):
+    compiled = frames_at(np.linspace(-1, 1, 7))
+    monkeypatch.setattr(native.shutil, "which", lambda name: None)
+    panda.cache_clear()
+    try:
+        with pytest.warns(UserWarning, match="no C compiler"):
+            interpreted = frames_at(np.linspace(-1, 1, 7))
+    finally:
+        panda.cache_clear()
+    np.testing.assert_allclose(interpreted, compiled, atol=1e-12)
+
+
+angle = st.floats(-3.2, 3.2)
+small = st.floats(0.01, 0.1)
+near_zero = st.floats(-0.2, 0.2)
+
+
+@given(near_zero, near_zero, angle, small, small, angle, small, small)
+@settings(max_examples=100, deadline=None)
+def test_rectangle_gap_bounds_sampled_distance(x, y, a, hx, hy, b, gx, gy):
+    def boundary(cx, cy, yaw, sx, sy):
+        t = np.linspace(-1, 1, 41)
+        one = np.ones_like(t)
+        edge = np.vstack([np.c_[t * sx, one * sy], np.c_[t * sx, -one * sy],
+                          np.c_[one * sx, t * sy], np.c_[-one * sx, t * sy]])  # fmt: skip
+        c, s = math.cos(yaw), math.sin(yaw)
+        return edge @ np.array([[c, s], [-s, c]]) + [cx, cy]
+
+    gap = rectangle_gap(0.0, 0.0, a, hx, hy, x, y, b, gx, gy)
+    P, Q = boundary(0, 0, a, hx, hy), boundary(x, y, b, gx, gy)
+    distance = np.linalg.norm(P[:, None] - Q[None], axis=2).min()
+    if gap > 0:
+        assert gap <= distance + 1e-9
+    else:  # overlapping: one has a boundary point inside the other
+        c, s = math.cos(b), math.sin(b)
+        local = (P - [x, y]) @ np.array([[c, -s], [s, c]])
+        inside = (np.abs(local) <= [gx + 0.01, gy + 0.01]).all(1).any()
+        c, s = math.cos(a), math.sin(a)
+        local = Q @ np.array([[c, -s], [s, c]])
+        assert inside or (np.abs(local) <= [hx + 0.01, hy + 0.01]).all(1).any()
+
+
+def test_separation_gradient_equals_finite_differences():
+    rng, h, checked = np.random.default_rng(4), 1e-7, 0
+    n, x, scratch = np.zeros(3), np.zeros(3), np.zeros(3)
+
+    def turned(R, w):
+        K = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+        return R + K @ R
+
+    for _ in range(200):
+        p, half = rng.uniform(-0.15, 0.15, 3), rng.uniform(0.01, 0.05, 3)
+        R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        obstacle = np.r_[rng.uniform(-0.1, 0.1, 3), rng.uniform(-3, 3), rng.uniform(0.02, 0.06, 3)]
+        d = separation(p, R, half, obstacle, n, x)
+        grad_v, grad_w = n.copy(), np.cross(x - p, n)
+        o_v, o_w = -n.copy(), -np.cross(x - obstacle[:3], n)[2]
+        unused = scratch.copy()
+        numeric_v = [
+            (separation(p + h * e, R, half, obstacle, scratch, unused) - d) / h for e in np.eye(3)
+        ]
+        numeric_w = [
+            (separation(p, turned(R, h * e), half, obstacle, scratch, unused) - d) / h
+            for e in np.eye(3)
+        ]
+        moved = [obstacle + h * np.eye(7)[i] for i in range(4)]
+        numeric_o = [(separation(p, R, half, o, scratch, unused) - d) / h for o in moved]
+        np.testing.assert_allclose(numeric_v, grad_v, atol=1e-5)
+        np.testing.assert_allclose(numeric_w, grad_w, atol=1e-4)
+        np.testing.assert_allclose(numeric_o, [*o_v, o_w], atol=1e-4)
+        checked += 1
+    assert checked == 200
+
+
+def test_banded_solve_equals_dense():
+    rng, n, width = np.random.default_rng(5), 30, 5
+    L = np.tril(rng.normal(size=(n, n)))
+    L[np.subtract.outer(np.arange(n), np.arange(n)) >= width] = 0
+    A, b = L @ L.T + np.eye(n), rng.normal(size=n)
+    band = np.array([[A[i, i - d] if i >= d else 0.0 for d in range(width)] for i in range(n)])
+    x = b.copy()
+    assert banded_solve(band, x)
+    np.testing.assert_allclose(x, np.linalg.solve(A, b), atol=1e-9)
+    assert not banded_solve(-np.ones((3, 2)), np.ones(3))
+
+
+def test_path_gradient_equals_finite_differences():
+    arm, rng = panda(), np.random.default_rng(6)
+    body = keyframes.bodies(arm, 0.03)
+    obstacles = np.array(
+        [[0.1, 0.0, 0.06, 0.3, 0.05, 0.04, 0.06], [0, 0, -0.05, 0, 0.4, 0.6, 0.05]]
+    )
+    X = np.zeros((7, ARM))
+    for t in range(7):
+        hand_down(np.array([0.0 + 0.03 * t, 0.02, 0.2, 0.4]), BASE, arm.lower, arm.upper, X[t])
+    X += rng.normal(scale=0.01, size=X.shape)
+    targets = np.zeros((7, 5))
+    targets[5] = 0.15, 0.02, 0.21, 0.4, 1.0
+    samples = np.array([[t, s] for t in range(6) for s in (0.0, 0.5) if t or s])
+    shape = (len(samples), len(body.link), len(obstacles))
+    multipliers = rng.uniform(0, 0.1, (7, 6)), rng.uniform(0, 0.1, shape), np.zeros((7, ARM, 2))
+    margin = np.full(shape[1:], 0.05)
+    band, g = np.zeros((5 * ARM, 3 * ARM)), np.zeros(5 * ARM)
+
+    def merit(rows):
+        return path._assemble(
+            rows, BASE, arm.lower, arm.upper, body.link, body.centre, body.half, obstacles, margin,
+            samples, len(samples), targets, arm.frames.x, arm.frames.y, arm.frames.handle,
+            arm.grasp.x, arm.grasp.y, arm.grasp.handle, *multipliers, 7.0, False, band, g,
+        )[0]  # fmt: skip
+
+    merit(X)
+    gradient, h = g.copy(), 1e-6
+    numeric = np.zeros_like(gradient)
+    for i in range(len(gradient)):
+        step = np.zeros_like(X)
+        step[1 + i // ARM, i % ARM] = h
+        numeric[i] = (merit(X + step) - merit(X - step)) / (2 * h)
+    assert np.abs(gradient).max() > 0.01
+    np.testing.assert_allclose(gradient, numeric, atol=2e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_pose_bound_never_refuses_what_a_grid_finds(seed):
+    rng, arm = np.random.default_rng(seed), panda()
+    table, refused, found = np.array([0.4, 0.6]), 0, 0
+    for _ in range(60):
+        size = rng.uniform(0.04, 0.07, 3)
+        box = Box(name="b", size=tuple(size), position=(0, 0, size[2] / 2), color=(1, 0, 0))
+        grasp = placement.grasps(box)[0]
+        count = rng.integers(3, 9)
+        obstacles = np.c_[rng.uniform(-0.12, 0.12, (count, 2)), np.full(count, 0.04),
+                          rng.uniform(-3, 3, count), rng.uniform(0.02, 0.05, (count, 2)),
+                          np.full(count, 0.04)]  # fmt: skip
+        region = np.array([0.0, 0.0, 0.2, 0.05, 0.03])
+        near, far = reach_interval(0.15, BASE, arm.lower, arm.upper)
+        pose = np.zeros(3)
+        common = (0.0, grasp.parts, obstacles, table, BASE, near, far)
+        status, _ = placement.find_pose(region, np.zeros(2), *common, pose)
+        c, s = math.cos(0.2), math.sin(0.2)
+        grid = max(
+            placement.slack(c * x - s * y, s * x + c * y, angle, *common)
+            for x in np.linspace(-0.05, 0.05, 15)
+            for y in np.linspace(-0.03, 0.03, 9)
+            for angle in np.linspace(0, math.pi, 24, endpoint=False)
+        )
+        if status == NONE:
+            refused += 1
+            assert grid < 0
+        if status == FOUND:
+            found += 1
+            assert placement.slack(*pose, *common) >= 0
+            local = np.array([[c, s], [-s, c]]) @ pose[:2]
+            assert (np.abs(local) <= [0.05, 0.03]).all()
+    assert refused > 3
+    assert found > 3

@@ -1,0 +1,512 @@
+"""Training: polling order, batches by (seed, step), checkpoints, a killed run, metrics."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from relevance import training
+from relevance.examples import Examples, gather, in_the_mirror, load_examples, true_geometry
+from relevance.generation import Counts, DatasetConfig, generate_shard, prepare
+from relevance.models import ModelConfig, RelevanceModel, relevance_loss
+from relevance.sampling import SceneConfig, sample_goals
+from relevance.scene import Camera, Predicate
+from relevance.store import Dataset, DatasetError
+from relevance.training import (
+    CheckpointError,
+    TrainConfig,
+    accuracy,
+    batch_loss,
+    draw_batch,
+    load_checkpoint,
+    measure,
+    polling,
+    train,
+)
+
+SAME_PLANE = tuple(p for p in Predicate if p is not Predicate.ON)
+DATA = DatasetConfig(
+    seed=5,
+    train=Counts(same_plane=6, on=4),
+    validation=Counts(same_plane=2, on=2),
+    scenes_per_shard=4,
+    scene=SceneConfig(max_objects=5),
+)
+CONFIG = TrainConfig(
+    model=ModelConfig(width=32, heads=2, layers=1, channels=8),
+    steps=6,
+    scenes_per_batch=4,
+    save_every=2,
+    threads=1,
+)
+
+
+def label(dataset: Dataset) -> None:
+    """Labels by a rule that needs no planner: the subject, and what stands within 20 cm of it."""
+    for predicate in Predicate:
+        for split in ("train", "validation"):
+            for shard in dataset.shards(split, predicate.family):
+                rows = []
+                for sample in dataset.samples(split, [shard]):
+                    scene = sample.scene
+                    for goal in sample_goals(scene, predicate, 2, seed=1):
+                        middle = np.array(scene[goal.subject].position)
+                        for box in scene.objects:
+                            near = np.linalg.norm(np.array(box.position) - middle) < 0.2
+                            names = {"subject": goal.subject, "reference": goal.reference}
+                            rows.append(
+                                {
+                                    "plan_id": f"{scene.id}-{goal}",
+                                    "scene_id": scene.id,
+                                    "split": split,
+                                    "shard": shard,
+                                    "predicate": predicate.value,
+                                    **names,
+                                    "query": box.name,
+                                    "relevant": bool(near and box.name != goal.reference),
+                                    "is_goal_object": box.name in names.values(),
+                                    "ambiguous": goal.subject == scene.names[0],
+                                    "policy": "found",
+                                    "visible_fraction": 1.0,
+                                    "planner_version": "rule",
+                                    "config_hash": "rule",
+                                }
+                            )
+                dataset.write_rows(
+                    "labels", rows, split=split, shard=shard, predicate=predicate.value
+                )
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Real scenes and images in real shards."""
+    root = tmp_path_factory.mktemp("dataset")
+    for spec in prepare(root, DATA):
+        generate_shard(root, DATA, spec)
+    label(Dataset.open(root))
+    return root
+
+
+@pytest.fixture
+def root(made: Path, tmp_path: Path) -> Path:
+    """A copy of its own for a test that writes."""
+    return Path(shutil.copytree(made, tmp_path / "dataset"))
+
+
+@pytest.fixture(scope="module")
+def examples(made: Path) -> Examples:
+    return load_examples(Dataset.open(made), "train", camera=Camera())
+
+
+# --- polling and batches ------------------------------------------------------------------
+
+
+def test_polling_takes_the_predicates_in_turn(examples: Examples) -> None:
+    strict = replace(CONFIG, share_encodings=False, mirror=False)
+    seen = [draw_batch(examples, strict, step).turns[0][0] for step in range(12)]
+    assert seen == [*Predicate, *Predicate, *list(Predicate)[:2]]
+    shared = replace(strict, share_encodings=True)
+    steps = [[turn[0] for turn in draw_batch(examples, shared, s).turns] for s in range(4)]
+    assert steps == [[*SAME_PLANE], [Predicate.ON]] * 2
+    assert [p for step in steps for p in step] == [*Predicate, *Predicate]
+
+
+def test_polling_shares_steps_only_among_neighbours_of_a_family() -> None:
+    mixed = [Predicate.ON_THE_LEFT, Predicate.ON, Predicate.BEHIND, Predicate.IN_FRONT]
+    assert polling(mixed, share=True) == [(mixed[0],), (mixed[1],), (mixed[2], mixed[3])]
+    assert polling(mixed, share=False) == [(p,) for p in mixed]
+
+
+def test_a_predicate_without_labels_is_left_out(root: Path) -> None:
+    shutil.rmtree(root / "labels/predicate=behind")
+    examples = load_examples(Dataset.open(root), "train", camera=Camera())
+    steps = [draw_batch(examples, replace(CONFIG, mirror=False), s).turns for s in range(2)]
+    names = [turn[0].value for turns in steps for turn in turns]
+    assert names == ["on-the-left", "on-the-right", "in-front", "on"]
+
+
+def test_every_scene_comes_before_any_comes_again(examples: Examples) -> None:
+    config = replace(CONFIG, scenes_per_batch=3, mirror=False, recolor=False)
+    for first, own in ((0, examples.scenes(SAME_PLANE)), (1, examples.scenes([Predicate.ON]))):
+        shown: list[int] = []
+        for step in range(first, first + 2 * 2 * len(own), 2):
+            image = draw_batch(examples, config, step).image.permute(0, 2, 3, 1).numpy()
+            for picture in image:
+                match = [i for i in own if np.array_equal(picture, examples.images[i])]
+                assert len(match) == 1
+                shown += match
+        epochs = np.array(shown).reshape(-1, len(own))
+        assert len(epochs) == 6
+        assert (np.sort(epochs, axis=1) == own).all()
+        assert (epochs[0] != epochs[1]).any(), "each epoch has an order of its own"
+
+
+def test_a_batch_depends_on_seed_and_step_alone(examples: Examples) -> None:
+    def same(a: training.Batch, b: training.Batch) -> bool:
+        tensors = [(x.image, x.views, x.geometry, *x.turns[0][1:]) for x in (a, b)]
+        return all(
+            x.shape == y.shape and bool((x == y).all()) for x, y in zip(*tensors, strict=True)
+        )
+
+    batches = [draw_batch(examples, CONFIG, step) for step in range(6)]
+    assert all(same(batches[s], draw_batch(examples, CONFIG, s)) for s in reversed(range(6)))
+    other = replace(CONFIG, seed=1)
+    assert not all(same(batches[s], draw_batch(examples, other, s)) for s in range(6))
+
+
+def test_most_goals_of_a_scene(examples: Examples) -> None:
+    one = replace(CONFIG, goals_per_scene=1)
+    for step in range(4):
+        for _, goals, _, labelled in draw_batch(examples, one, step).turns:
+            assert goals.shape[1] == 1
+            assert labelled.any(-1).all()
+
+
+def test_examples_are_the_stored_scenes_and_labels(made: Path, examples: Examples) -> None:
+    dataset = Dataset.open(made)
+    samples = list(dataset.samples("train"))
+    assert len(examples.images) == len(samples) == 10
+    place = {sample.scene.id: i for i, sample in enumerate(samples)}
+    for i, sample in enumerate(samples):
+        count = len(sample.scene.objects)
+        assert np.array_equal(examples.images[i], sample.image)
+        assert np.array_equal(examples.views[i, :count], sample.views)
+        assert examples.present[i].sum() == count
+        for row, box in zip(examples.geometry[i], sample.scene.objects, strict=False):
+            np.testing.assert_allclose(row[:3] / 10, box.position, atol=1e-6)
+            np.testing.assert_allclose(row[3:6] / 10, box.size, atol=1e-6)
+            np.testing.assert_allclose(row[[6, 10]] / 10, box.extents, atol=1e-6)
+        shown = set(np.unique(examples.cells[i])) - {0}
+        assert shown == set(range(1, count + 1))
+    for predicate in Predicate:
+        goals = examples.goals[predicate]
+        expected = {}
+        for row in dataset.read_rows("labels", split="train", predicate=predicate.value):
+            names = samples[place[row["scene_id"]]].scene.names
+            key = place[row["scene_id"]], names.index(row["subject"]), names.index(row["reference"])
+            expected.setdefault(key, {})[names.index(row["query"])] = row["relevant"]
+        found = {}
+        for i in range(len(samples)):
+            for k in range(goals.first[i], goals.first[i + 1]):
+                known = np.flatnonzero(goals.labelled[k]).tolist()
+                found[i, *goals.pairs[k].tolist()] = {q: goals.relevant[k, q] for q in known}
+        assert found == expected
+
+
+def test_images_mapped_from_a_file_are_the_same(
+    made: Path, examples: Examples, tmp_path: Path
+) -> None:
+    dataset = Dataset.open(made)
+    mapped = load_examples(dataset, "train", camera=Camera(), cache_bytes=1, folder=tmp_path)
+    assert isinstance(mapped.images, np.memmap)
+    assert np.array_equal(mapped.images, examples.images)
+    assert np.array_equal(mapped.views, examples.views)
+    assert list(tmp_path.iterdir()) == [], "the file has no name, so it cannot be left behind"
+
+
+def test_ambiguous_goals_and_other_policies_can_be_left_out(made: Path, examples: Examples) -> None:
+    dataset = Dataset.open(made)
+    clear = load_examples(dataset, "train", camera=Camera(), ambiguous=False)
+    rows = dataset.read_rows("labels", split="train", predicate="on", ambiguous=False)
+    assert len(clear.goals[Predicate.ON].pairs) == len({row["plan_id"] for row in rows})
+    assert len(clear.goals[Predicate.ON].pairs) < len(examples.goals[Predicate.ON].pairs)
+    assert load_examples(dataset, "train", camera=Camera(), policy="none").goals == {}
+
+
+def test_the_mirror_shows_the_mirrored_scene(made: Path, examples: Examples) -> None:
+    sample = next(Dataset.open(made).samples("train"))
+    batch = gather(examples, np.array([0]), SAME_PLANE)
+    flipped = in_the_mirror(batch)
+    boxes = tuple(
+        replace(box, position=(box.position[0], -box.position[1], box.position[2]), yaw=-box.yaw)
+        for box in sample.scene.objects
+    )
+    expected = true_geometry(replace(sample.scene, id="", goals=(), objects=boxes))
+    np.testing.assert_allclose(flipped.geometry[0].numpy(), expected, atol=1e-5)
+    assert np.array_equal(flipped.image[0].permute(1, 2, 0).numpy(), sample.image[:, ::-1])
+    names = [turn[0].value for turn in flipped.turns]
+    assert names == ["on-the-right", "on-the-left", "in-front", "behind"]
+    assert torch.equal(flipped.turns[0][2], batch.turns[0][2])
+    assert torch.equal(in_the_mirror(flipped).geometry, batch.geometry)
+
+
+# --- the loss and learning ----------------------------------------------------------------
+
+
+def test_loss_weighs_each_predicate_with_its_eta(examples: Examples) -> None:
+    torch.manual_seed(0)
+    model = RelevanceModel(replace(CONFIG.model, body="vit"))
+    config = replace(CONFIG, mirror=False, eta_same_plane=0.8, eta_on=0.6)
+    for step, eta in ((0, 0.8), (1, 0.6)):
+        batch = draw_batch(examples, config, step)
+        encoding = model.encode(batch.image, batch.views, batch.present)
+        terms = [
+            relevance_loss(model.decode(encoding, p, goals), relevant, labelled, eta)
+            for p, goals, relevant, labelled in batch.turns
+        ]
+        expected = sum(float(term.detach()) for term in terms) / len(terms)
+        parts = batch_loss(model, batch, config)
+        assert parts["loss"].item() == pytest.approx(expected, rel=1e-5)
+        assert set(parts) == {"loss", "relevance"}
+
+
+def test_each_scene_is_encoded_once_for_all_goals_and_predicates(
+    examples: Examples, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = RelevanceModel(CONFIG.model)
+    calls = []
+    encode = model.encode
+    monkeypatch.setattr(model, "encode", lambda *a: (calls.append(a[0].shape[0]), encode(*a))[1])
+    batch = draw_batch(examples, CONFIG, 0)
+    batch_loss(model, batch, CONFIG)
+    assert calls == [CONFIG.scenes_per_batch]
+    assert len(batch.turns) == 4
+
+
+@pytest.mark.parametrize("body", ["glimpse", "vit"])
+def test_a_network_learns_a_few_scenes_by_heart(examples: Examples, body: str) -> None:
+    model = ModelConfig(body=body, width=64, heads=2, layers=1, channels=16, hidden=64)
+    config = replace(
+        CONFIG, model=model, steps=80, scenes_per_batch=6, learning_rate=3e-3, recolor=False
+    )
+    config = replace(config, mirror=False)
+    trainer = training.Trainer(config, examples)
+    before = measure(trainer.model, examples)
+    losses = [trainer.step() for _ in range(config.steps)]
+    after = measure(trainer.model, examples)
+    assert np.mean([x["relevance"] for x in losses[-6:]]) < 0.5 * losses[0]["relevance"]
+    for family in ("same-plane", "on"):
+        found = after[family]["with_goal_objects"]
+        assert found["balanced"] > 0.8 > before[family]["with_goal_objects"]["balanced"]
+        assert found["total"] > found["base_rate"] + 0.1
+
+
+def test_rate_rises_then_falls(examples: Examples) -> None:
+    trainer = training.Trainer(replace(CONFIG, steps=200, warmup=0.05), examples)
+    rates = [trainer.rate(step) for step in range(200)]
+    assert rates[9] == pytest.approx(CONFIG.learning_rate)
+    assert max(rates) == pytest.approx(CONFIG.learning_rate)
+    assert rates[0] == pytest.approx(CONFIG.learning_rate / 10)
+    assert all(a > b for a, b in zip(rates[10:], rates[11:], strict=False))
+    assert rates[-1] < 1e-3 * CONFIG.learning_rate
+    assert rates[105] == pytest.approx(CONFIG.learning_rate / 2, rel=1e-6)
+
+
+# --- checkpoints --------------------------------------------------------------------------
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return load_checkpoint(path)[0].state_dict()
+
+
+def equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_train_writes_a_checkpoint_and_its_row(root: Path) -> None:
+    ticks: list[tuple[int, int]] = []
+    path = train(root, CONFIG, progress=lambda done, total: ticks.append((done, total)))
+    assert ticks == [(i, 6) for i in range(1, 7)]
+    dataset = Dataset.open(root)
+    (row,) = dataset.read_rows("checkpoints")
+    assert root / row["path"] == path
+    assert path.stem == row["checkpoint_id"]
+    assert sorted(p.name for p in path.parent.iterdir()) == [f"{path.stem}.parquet", path.name]
+    model, meta = load_checkpoint(path)
+    assert meta["dataset_hash"] == row["dataset_hash"] == dataset.content_hash()
+    assert TrainConfig.from_dict(meta["config"]) == CONFIG
+    assert meta["metrics"] == json.loads(row["metrics"])
+    assert set(meta["metrics"]) == {*(p.value for p in Predicate), "same-plane"}
+    validation = load_examples(dataset, "validation", camera=Camera())
+    assert measure(model, validation) == meta["metrics"], "the file holds the trained weights"
+    assert [entry["step"] for entry in meta["history"]] == [1, 2, 3, 4, 5, 6]
+    stamp = path.stat().st_mtime_ns
+    assert train(root, CONFIG) == path
+    assert path.stat().st_mtime_ns == stamp, "a finished run is not repeated"
+    dataset.shard_path("checkpoints", name=path.stem).unlink()
+    train(root, CONFIG)
+    assert dataset.read_rows("checkpoints") == [row], "a row lost in a kill comes back"
+
+
+def test_identity_is_the_config_and_the_data_but_not_the_execution(root: Path) -> None:
+    config = replace(CONFIG, steps=1)
+    path = train(root, config)
+    assert train(root, replace(config, threads=2, save_every=7, cache_bytes=0)) == path
+    assert train(root, replace(config, seed=1)) != path
+    assert not equal(weights(path), weights(train(root, replace(config, seed=1))))
+    dataset = Dataset.open(root)
+    labels = dataset.read_rows("labels", split="train", shard=0, predicate="behind")
+    labels[0]["relevant"] = not labels[0]["relevant"]
+    dataset.write_rows("labels", labels, split="train", shard=0, predicate="behind")
+    assert train(root, config) != path
+
+
+def test_files_in_another_folder(root: Path, tmp_path: Path) -> None:
+    path = train(root, replace(CONFIG, steps=1), out=tmp_path / "elsewhere")
+    assert path.parent == tmp_path / "elsewhere"
+    (row,) = Dataset.open(root).read_rows("checkpoints")
+    assert Path(row["path"]) == path.resolve()
+
+
+def test_a_killed_run_ends_with_the_same_weights(root: Path, made: Path, tmp_path: Path) -> None:
+    config = replace(CONFIG, steps=40, save_every=3)
+    code = (
+        "import sys, json; from relevance.training import TrainConfig, train;"
+        "train(sys.argv[1], TrainConfig.from_dict(json.loads(sys.argv[2])))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(root), json.dumps(config.to_dict())],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    folder, limit = root / "checkpoints", time.monotonic() + 120
+    while not list(folder.glob("*.state")):
+        assert process.poll() is None, "training ended before it saved a state"
+        assert time.monotonic() < limit, "no state was saved"
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    assert not list(folder.glob("*.pt")), "killed before the end"
+    ticks: list[int] = []
+    resumed = train(root, config, progress=lambda done, total: ticks.append(done))
+    assert ticks[0] > 3, "goes on from the saved state"
+    assert ticks[-1] == 40
+    assert not list(folder.glob("*.state"))
+    whole = train(Path(shutil.copytree(made, tmp_path / "again")), config)
+    assert equal(weights(resumed), weights(whole))
+    histories = [load_checkpoint(path)[1]["history"] for path in (resumed, whole)]
+    assert histories[0] == histories[1]
+
+
+def test_nothing_to_learn_from(root: Path) -> None:
+    shutil.rmtree(root / "labels")
+    with pytest.raises(DatasetError, match="no labels with split train and policy found"):
+        train(root, CONFIG)
+    assert not (root / "checkpoints").exists()
+    with pytest.raises(DatasetError, match=r"no dataset\.json there"):
+        train(root / "nowhere", CONFIG)
+
+
+def test_no_validation_labels_means_no_metrics(root: Path) -> None:
+    for folder in (root / "labels").glob("predicate=*/split=validation"):
+        shutil.rmtree(folder)
+    assert load_checkpoint(train(root, replace(CONFIG, steps=1)))[1]["metrics"] == {}
+
+
+def test_labels_of_a_missing_scene(root: Path) -> None:
+    dataset = Dataset.open(root)
+    rows = dataset.read_rows("labels", split="train", shard=0, predicate="behind")
+    rows = [row | {"scene_id": "0000"} for row in rows]
+    dataset.write_rows("labels", rows, split="train", shard=0, predicate="behind")
+    with pytest.raises(DatasetError, match="labels of split train name scene 0000, which no image"):
+        train(root, CONFIG)
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(CheckpointError) as error:
+        load_checkpoint(path)
+    message = str(error.value)
+    assert str(path) in message
+    assert "\n" not in message
+    assert "expected" in message
+    return message
+
+
+def test_checkpoint_errors(root: Path) -> None:
+    path = train(root, replace(CONFIG, steps=1))
+    whole = path.read_bytes()
+    assert "no such file" in refused(path.parent / "none.pt")
+    for size in (0, 10, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        assert "truncated or not a checkpoint" in refused(path)
+    path.write_bytes(b"not a checkpoint at all")
+    assert "truncated or not a checkpoint" in refused(path)
+    path.write_bytes(whole)
+    content = torch.load(path, weights_only=True)
+    torch.save({**content, "version": 99}, path)
+    assert "schema version 99, expected schema version 1" in refused(path)
+    torch.save([1, 2], path)
+    assert "schema version None, expected schema version 1" in refused(path)
+    torch.save({**content, "kind": "state"}, path)
+    assert "holds a state, expected a checkpoint" in refused(path)
+    torch.save({**content, "model": {}}, path)
+    assert "does not fit its weights" in refused(path)
+    meta = {**content["meta"], "config": {**content["meta"]["config"], "depth": 3}}
+    torch.save({**content, "meta": meta}, path)
+    assert "depth" in refused(path)
+    assert "no such file" not in refused(path.parent), "a folder is no checkpoint"
+
+
+# --- metrics and config -------------------------------------------------------------------
+
+
+def test_accuracy_by_hand() -> None:
+    score = np.array([3.0, -1.0, 0.5, -2.0, -3.0, 0.5])
+    relevant = np.array([True, True, False, False, False, True])
+    found = accuracy(score, relevant)
+    assert found["relevant"] == 3
+    assert found["irrelevant"] == 3
+    assert found["true_relevant"] == pytest.approx(2 / 3)
+    assert found["true_irrelevant"] == pytest.approx(2 / 3)
+    assert found["total"] == pytest.approx(4 / 6)
+    assert found["base_rate"] == pytest.approx(0.5)
+    assert found["balanced"] == pytest.approx(2 / 3)
+    # pairs won: 3.0 wins 3, -1.0 wins 2, 0.5 wins 2 and ties 1
+    assert found["auc"] == pytest.approx((3 + 2 + 2.5) / 9)
+
+
+def test_accuracy_of_one_class_or_of_nothing_has_no_balance() -> None:
+    assert accuracy(np.array([1.0]), np.array([True]))["balanced"] is None
+    assert accuracy(np.array([1.0]), np.array([True]))["auc"] is None
+    assert accuracy(np.zeros(0), np.zeros(0, bool))["total"] is None
+
+
+def test_measure_counts_queries_and_goals(examples: Examples, made: Path) -> None:
+    model = RelevanceModel(CONFIG.model)
+    found = measure(model, examples, batch=3)
+    rows = Dataset.open(made).read_rows("labels", split="train")
+    for predicate in Predicate:
+        own = [row for row in rows if row["predicate"] == predicate.value]
+        queries = [row for row in own if not row["is_goal_object"]]
+        group = found[predicate.value]
+        assert group["goals"] == len({row["plan_id"] for row in own})
+        for name, part in (("queries", queries), ("with_goal_objects", own)):
+            relevant = sum(row["relevant"] for row in part)
+            assert group[name]["relevant"] == relevant
+            assert group[name]["irrelevant"] == len(part) - relevant
+            assert group[name]["base_rate"] == pytest.approx(1 - relevant / len(part))
+    assert found["same-plane"]["goals"] == sum(found[p.value]["goals"] for p in SAME_PLANE)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"steps": 0}, "TrainConfig.steps is 0, expected at least 1"),
+        ({"learning_rate": 0.0}, "TrainConfig.learning_rate is 0.0, expected more than 0"),
+        ({"eta_on": 1.0}, "TrainConfig.eta_on is 1.0, expected between 0 and 1"),
+        ({"warmup": 1.0}, "TrainConfig.warmup is 1.0, expected a share below 1"),
+        ({"bfloat16": "maybe"}, "TrainConfig.bfloat16 is 'maybe', expected auto, on or off"),
+    ],
+)
+def test_config_refuses(change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        TrainConfig(**change)
+
+
+def test_presets_survive_plain_values() -> None:
+    for config in (TrainConfig.smoke(), TrainConfig.demo(), TrainConfig.laptop()):
+        assert TrainConfig.from_dict(config.to_dict()) == config
+    paper = TrainConfig.from_dict(TrainConfig.paper().to_dict())
+    assert paper.model.body == "vit"
+    assert paper.model.width == 768
+    assert TrainConfig.demo().content_hash != TrainConfig.smoke().content_hash
