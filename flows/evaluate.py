@@ -49,19 +49,12 @@ SPEED = """
 """
 
 
-@task(name="predict-shard", **_TASK)
-def predict_one(root: str, checkpoint: str, split: str, shard: int) -> int:
-    """Score every labelled object of one shard."""
-    from relevance.evaluation import predict
-
-    return predict(root, checkpoint, split=split, shards=[shard])
-
-
 @task(name="evaluate-shard", **_TASK)
 def evaluate_one(root: str, checkpoint: str, config: EvaluationConfig, shard: int) -> int:
-    """Rerun the planner, unguided and guided, on the tasks of one shard."""
+    """Score the labelled objects of one shard, then rerun the planner on its tasks."""
     from relevance import evaluation
 
+    evaluation.predict(root, checkpoint, split=config.split, shards=[shard])
     return evaluation.evaluate(root, checkpoint, config, shards=[shard])
 
 
@@ -106,16 +99,17 @@ def evaluate(
     shards = there.shards(config.split)
     if not shards:
         raise ParameterError(f"{root}: no {config.split} scenes, expected `generate` first")
-    common = {"root": str(root), "checkpoint": str(path)}
-    run_shards(
-        predict_one,
-        {f"{config.split}-{n:06d}": {**common, "split": config.split, "shard": n} for n in shards},
-        stage="predict",
-        max_workers=max_workers,
-    )
     run_shards(
         evaluate_one,
-        {f"{config.split}-{n:06d}": {**common, "config": config, "shard": n} for n in shards},
+        {
+            f"{config.split}-{shard:06d}": {
+                "root": str(root),
+                "checkpoint": str(path),
+                "config": config,
+                "shard": shard,
+            }
+            for shard in shards
+        },
         stage="evaluate",
         max_workers=max_workers,
     )

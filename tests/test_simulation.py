@@ -26,6 +26,7 @@ from relevance.scene import (
     Pose,
     Robot,
     Scene,
+    SceneError,
     Table,
     scene_to_json,
 )
@@ -348,9 +349,9 @@ class Arm:
         )
         return np.array(state[4]), np.reshape(pybullet.getMatrixFromQuaternion(state[5]), (3, 3))
 
-    def solve(self, point, yaw: float, start: np.ndarray) -> np.ndarray:
+    def solve(self, point, yaw: float, start: np.ndarray, tilt: float = 0.0) -> np.ndarray:
         """Joint angles (7,) with the grasp point at `point`, hand down, y axis turned by yaw."""
-        turn = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+        turn = pybullet.getQuaternionFromEuler((tilt, 0.0, yaw))
         _, orientation = pybullet.multiplyTransforms((0, 0, 0), turn, (0, 0, 0), (1, 0, 0, 0))
         q = start
         for _ in range(200):
@@ -497,6 +498,11 @@ def test_replay_from_a_turned_robot(arm, good):
         ("squeezed", "off the box's face"),
         ("beside", "not between the fingers"),
         ("unknown", "no such box"),
+        ("misplaced", "the hand holds 'red'"),
+        ("greedy", "the hand holds 'red' already"),
+        ("pushed", "expected pick or place"),
+        ("tilted", "tilted by 0.030 rad"),
+        ("deep", "red penetrates table by 1.5 mm"),
         ("keeps", "ends with 'red' in the hand"),
         ("unfinished", "the plan ends with the hand at the box"),
         ("floats", "over its support"),
@@ -531,6 +537,18 @@ def test_replay_refuses(name, reason, good, arm):
         pick = replace(pick, action=Action(name="pick", object="green"))
     elif name == "unknown":
         pick = replace(pick, action=Action(name="pick", object="grey"))
+    elif name == "misplaced":
+        place = replace(place, action=Action(name="place", object="green", support="table"))
+    elif name == "greedy":
+        place = replace(place, action=Action(name="pick", object="green"))
+    elif name == "pushed":
+        place = replace(place, action=Action(name="push", object="red"))
+    elif name in ("tilted", "deep"):
+        end, yaw = arm.at(place.q[-1])[0], TARGET.yaw + math.pi / 2
+        lower = 0.0015 if name == "deep" else 0.0
+        last = arm.solve(end - (0, 0, lower), yaw, place.q[-1], 0.03 if name == "tilted" else 0.0)
+        place = replace(place, q=np.vstack([place.q[:-1], last]))
+        leave = replace(leave, q=np.vstack([last, leave.q[1:]]))
     elif name == "keeps":
         place = replace(place, action=None)
         leave = replace(leave, carried="red", opening=place.opening)
@@ -562,6 +580,40 @@ def test_replay_refuses_overlap_with_a_neighbour(good, arm):
     verdict = replay(Scene(objects=(*SCENE.objects, wall)), GOAL, good)
     assert "penetrates grey" in verdict.reason
     assert "phase 1" in verdict.reason
+
+
+def test_replay_refuses_to_put_a_box_over_an_edge(arm):
+    to = Pose(position=(-0.05, -0.13, 0.04), yaw=0.0)
+    narrow = Scene(objects=(RED, box("blue", 0.15, 0.08)), table=Table(size=(0.8, 0.28)))
+    verdict = replay(narrow, Goal.parse("on(red, blue)"), carry(arm, RED, to))
+    assert "the box is not on the table" in verdict.reason
+
+    on_blue = Goal.parse("on(red, blue)")
+    to = Pose(position=(0.02 - 0.045, 0.22, 0.07 + 0.04), yaw=0.0, on="blue")
+    verdict = replay(SCENE, on_blue, carry(arm, RED, to, support="blue"))
+    assert "centre is not over 'blue'" in verdict.reason
+
+
+def test_replay_measures_a_corner_exactly(arm):
+    """Red comes down with a corner 1.3 mm deep in the face of its neighbour."""
+    depth = 0.0013
+    reach = (RED.size[0] + RED.size[1]) / 2 * math.sqrt(0.5)
+    y = BLUE.position[1] - BLUE.extents[1] - reach + depth
+    to = Pose(position=(0.02, y, 0.04), yaw=math.pi / 4)
+    verdict = replay(SCENE, GOAL, carry(arm, RED, to))
+    assert "red penetrates blue by 1.3 mm" in verdict.reason
+
+
+def test_replay_sees_fingers_close_on_something_else(arm):
+    """A plate that open and closed fingers both clear is hit on the way."""
+    slim = box("red", 0.0, 0.0, size=(0.012, 0.06, 0.08))
+    plate = box("grey", 0.0365, 0.0, size=(0.005, 0.02, 0.08))
+    to = replace(TARGET, position=(0.02, 0.22 - 0.03 - 0.006 - 0.03, 0.04))
+    phases = carry(arm, slim, to)
+    assert replay(Scene(objects=(slim, BLUE)), GOAL, phases).ok
+    verdict = replay(Scene(objects=(slim, BLUE, plate)), GOAL, phases)
+    assert "pick red: panda_" in verdict.reason
+    assert "finger penetrates grey" in verdict.reason
 
 
 def test_replay_sees_the_carried_box(good):
@@ -625,6 +677,11 @@ def test_replay_agrees_with_itself_at_finer_steps(good):
     assert fine.ok
     with pytest.raises(ValueError, match="substeps = 0"):
         replay(SCENE, GOAL, good, substeps=0)
+
+
+def test_replay_refuses_a_goal_about_nothing(good):
+    with pytest.raises(SceneError, match="unknown object 'grey'"):
+        replay(SCENE, Goal.parse("behind(red, grey)"), good)
 
 
 def test_replay_outlives_many_worlds(good, arm):

@@ -73,10 +73,12 @@ def replay(scene: Scene, goal: Goal, phases: Sequence[Phase], *, substeps: int =
     boxes stand flat on what the action says), the goal at the end, and the overlap of robot,
     boxes and table with each other. Not counted as overlap: fingers with the box between
     them, the robot's base with the table, neighbouring links of the robot.
+
+    Raises SceneError when the goal names no object of the scene.
     """
     if substeps < 1:
         raise ValueError(f"substeps = {substeps}: expected at least 1")
-    return _Run(_arena(os.getpid()), scene).judge(goal, phases, substeps)
+    return _Run(_arena(os.getpid()), scene).judge(scene.goal(goal), phases, substeps)
 
 
 class _Refused(Exception):

@@ -137,7 +137,7 @@ def read_parquet(schema: TableSchema, file: Path) -> pa.Table:
             "the file was changed after it was written"
         )
     try:
-        return parquet.read()
+        return parquet.read(use_threads=len(content) > 1_000_000)
     except (pa.ArrowException, OSError) as error:
         raise DatasetError(f"{file}: expected readable rows, found {one_line(error)}") from None
 
