@@ -31,6 +31,7 @@ from relevance.scene import (
     footprint_gap,
     goal_holds,
     region,
+    scene_from_json,
     scene_to_json,
 )
 
@@ -288,8 +289,6 @@ def test_on_goals_prefer_a_reference_that_carries(stacked):
 
 
 def test_scenes_survive_json(stacked):
-    from relevance.scene import scene_from_json
-
     for scene in stacked[:20]:
         assert scene_from_json(scene_to_json(scene)) == scene
 

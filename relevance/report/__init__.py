@@ -249,17 +249,15 @@ def _planner(rows: Any) -> dict[str, Any]:
         order by goals desc, status, reason
         """
     )
-    by_family = {
-        group: np.array(
-            [
-                row["seconds"]
-                for row in rows("select predicate, seconds from timings")
-                if in_group(row["predicate"], group)
-            ]
-        )
-        for group in GROUPS
-    }
-    by_family = {group: values for group, values in by_family.items() if len(values)}
+    families = rows(
+        """
+        select case predicate when 'on' then 'on' else 'same-plane' end as family,
+            count(*) as n, quantile_cont(seconds, $1::double[]) as quantiles
+        from timings group by family order by family desc
+        """,
+        plots.QUANTILES.tolist(),
+    )
+    middle = rows("select count(*) as n, median(seconds) as median from timings")[0]
     versions = [
         row["planner_version"] for row in rows("select distinct planner_version from plans")
     ]
@@ -269,13 +267,12 @@ def _planner(rows: Any) -> dict[str, Any]:
         key: sum(row[key] or 0 for row in verdicts)
         for key in ("goals", "solved", "plans", "ambiguous", "replayed", "replay_ok")
     }
-    everything = np.concatenate(list(by_family.values())) if by_family else np.array([])
     return {
         "verdicts": verdicts,
         "total": total,
         "seconds": [row | {"counts": counts_of.get(row["predicate"], {})} for row in seconds],
-        "median": float(np.median(everything)) if len(everything) else math.nan,
-        "n_timed": len(everything),
+        "median": middle["median"],
+        "n_timed": middle["n"],
         "versions": versions,
         "reasons": reasons,
         "reasons_plot": plots.svg(
@@ -286,7 +283,7 @@ def _planner(rows: Any) -> dict[str, Any]:
         )
         if reasons
         else "",
-        "times_plot": plots.svg("times", plots.times, times=by_family) if by_family else "",
+        "times_plot": plots.svg("times", plots.times, rows=families) if families else "",
     }
 
 

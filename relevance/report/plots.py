@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from relevance.report.figures import Comparison, Predictions, guided_cost, mean_interval
 from relevance.scene import Predicate
@@ -47,6 +47,8 @@ SHARES = (
     ("true irrelevant", "true_irrelevant", "#8a939d"),
     ("total", "total", "#22282f"),
 )
+QUANTILES = np.linspace(0, 1, 201)
+"""Shares at which distributions of times are drawn; the middle one is the median."""
 _STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
@@ -105,6 +107,16 @@ def _percent_axis(axis: Any) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{round(100 * value, 2):g}%"))
 
 
+def _log_seconds(ax: Axes, which: str) -> None:
+    """Logarithmic scale in seconds, labelled at 1, 2 and 5."""
+    (ax.set_xscale if which == "x" else ax.set_yscale)("log")
+    axis = ax.xaxis if which == "x" else ax.yaxis
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low < 300 else (1,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: seconds(value)))
+    axis.set_minor_formatter(NullFormatter())
+
+
 def seconds(value: float) -> str:
     """Seconds in the unit that reads best."""
     if not math.isfinite(value):
@@ -155,7 +167,8 @@ def lengths(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     ax.set_xlabel("actions in the plan")
     ax.set_ylabel("share of solved tasks")
     ax.grid(axis="x", visible=False)
-    ax.legend()
+    ax.margins(y=0.2)
+    ax.legend(loc="upper right")
     _percent_axis(ax.yaxis)
 
 
@@ -172,21 +185,20 @@ def reasons(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     ax.set_xlabel("tasks")
 
 
-def times(ax: Axes, times: dict[str, np.ndarray]) -> None:
+def times(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Distribution of planning times; rows hold a family's QUANTILES, s."""
     ax.axvspan(*PAPER_SECONDS, color="#f0e4d4", zorder=0)
-    ax.text(PAPER_SECONDS[1] * 1.1, 0.04, "paper, means", color=MUTED, fontsize=8.5)
-    for group, values in times.items():
-        values = np.sort(values)
-        label = f"{group}: median {seconds(float(np.median(values)))} (n = {len(values)})"
-        share = np.arange(1, len(values) + 1) / len(values)
-        ax.plot(values, share, color=GROUP_COLOR[group], drawstyle="steps-post", label=label)
-    ax.set_xscale("log")
-    ax.set_xlim(right=max(20.0, *(float(v.max()) for v in times.values())))
+    ax.text(PAPER_SECONDS[0] * 0.88, 0.03, "paper, means", ha="right", color=MUTED, fontsize=8.5)
+    for row in rows:
+        found, group = row["quantiles"], row["family"]
+        label = f"{group}: median {seconds(found[len(found) // 2])} (n = {row['n']})"
+        ax.plot(found, QUANTILES, color=GROUP_COLOR[group], label=label)
     ax.set_xlabel("planning time of a task")
     ax.set_ylabel("share of tasks done")
     ax.legend(loc="upper center", bbox_to_anchor=(0.45, -0.2))
     _percent_axis(ax.yaxis)
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: seconds(value)))
+    _log_seconds(ax, "x")
+    ax.set_xlim(right=max(20.0, *(row["quantiles"][-1] for row in rows)))
 
 
 def accuracy(ax: Axes, predictions: Predictions) -> None:
@@ -289,12 +301,11 @@ def by_objects(ax: Axes, rows: dict[str, list[dict[str, Any]]]) -> None:
         ax.plot(counts, [m.value for m in means], "o-", markersize=4, color=color, label=name)
         lows, highs = [m.low for m in means], [m.high for m in means]
         ax.fill_between(counts, lows, highs, color=color, alpha=0.15, linewidth=0)
-    ax.set_yscale("log")
+    _log_seconds(ax, "y")
     ax.set_xlabel("objects in the scene")
     ax.set_ylabel("mean CPU time a task")
     ax.legend()
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: seconds(value)))
 
 
 def pairs(ax: Axes, rows: dict[str, list[dict[str, Any]]]) -> None:
@@ -311,14 +322,12 @@ def pairs(ax: Axes, rows: dict[str, list[dict[str, Any]]]) -> None:
             if part:
                 x = [row["seconds_unguided"] for row in part]
                 y = [row["seconds_guided"] for row in part]
-                ax.scatter(
-                    x, y, s=16, marker=marker, color=GUIDE_COLOR[name], alpha=0.7, label=label
-                )
-    for axis, set_scale in ((ax.xaxis, ax.set_xscale), (ax.yaxis, ax.set_yscale)):
-        set_scale("log")
-        axis.set_major_formatter(FuncFormatter(lambda value, _: seconds(value)))
+                style = {"s": 16, "marker": marker, "color": GUIDE_COLOR[name], "alpha": 0.7}
+                ax.scatter(x, y, label=label, rasterized=len(part) > 2000, **style)
     ax.set_xlim(low, high)
     ax.set_ylim(low, high)
+    _log_seconds(ax, "x")
+    _log_seconds(ax, "y")
     ax.set_xlabel("CPU time unguided")
     ax.set_ylabel("CPU time guided")
     ax.legend(loc="upper left")
@@ -356,6 +365,8 @@ def training_curve(ax: Axes, history: Sequence[Mapping[str, float]]) -> None:
         steps, values = [h["step"] for h in history], [h[name] for h in history]
         ax.plot(steps, values, color=colors.get(name, MUTED), linewidth=1.5, label=name)
     ax.set_yscale("log")
+    for format in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+        format(FuncFormatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "125" else ""))
     ax.set_xlabel("step")
     ax.set_ylabel("training loss")
     ax.legend(ncols=2)
