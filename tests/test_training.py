@@ -12,6 +12,7 @@ import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -276,7 +277,9 @@ def test_each_scene_is_encoded_once_for_all_goals_and_predicates(
 
 
 @pytest.mark.parametrize("body", ["glimpse", "vit"])
-def test_a_network_learns_a_few_scenes_by_heart(examples: Examples, body: str) -> None:
+def test_a_network_learns_a_few_scenes_by_heart(
+    examples: Examples, body: Literal["glimpse", "vit"]
+) -> None:
     model = ModelConfig(body=body, width=64, heads=2, layers=1, channels=16, hidden=64)
     config = replace(
         CONFIG,
