@@ -17,7 +17,9 @@ FROM (
     UNION ALL SELECT file, row, split, shard FROM timings
     UNION ALL SELECT file, row, split, shard FROM labels
 )
-WHERE NOT ends_with(file, 'split=' || split || '/shard-' || lpad(shard::VARCHAR, 6, '0') || '.parquet');
+WHERE NOT ends_with(
+    file, 'split=' || split || '/shard-' || lpad(shard::VARCHAR, 6, '0') || '.parquet'
+);
 
 -- rule: visible shares and counts are possible
 SELECT file, row, 'objects' AS "column",
@@ -31,7 +33,8 @@ WHERE o.visible_fraction NOT BETWEEN 0 AND 1 OR o.visible_pixels < 0;
 
 -- rule: a goal is planned once, in a scene of its split
 SELECT p.file, p.row, 'plan_id' AS "column", 'expected once, found ' || n || ' times' AS message
-FROM plans AS p JOIN (SELECT plan_id, count(*) AS n FROM plans GROUP BY plan_id) AS c USING (plan_id)
+FROM plans AS p
+JOIN (SELECT plan_id, count(*) AS n FROM plans GROUP BY plan_id) AS c USING (plan_id)
 WHERE n > 1
 UNION ALL
 SELECT p.file, p.row, 'scene_id', 'expected a scene of this shard, found ' || p.scene_id
@@ -41,7 +44,11 @@ WHERE s.scene_id IS NULL;
 -- rule: a plan names objects of its scene
 SELECT p.file, p.row, 'moved' AS "column",
     'expected objects of the scene, found '
-    || array_to_string(list_filter(p.moved || [p.subject, p.reference], lambda n: NOT list_contains(s.names, n)), ', ') AS message
+    || array_to_string(
+        list_filter(
+            p.moved || [p.subject, p.reference], lambda n: NOT list_contains(s.names, n)
+        ), ', '
+    ) AS message
 FROM plans AS p
 JOIN (SELECT scene_id, list(name) AS names FROM objects GROUP BY scene_id) AS s USING (scene_id)
 WHERE NOT list_has_all(s.names, p.moved || [p.subject, p.reference]);
@@ -55,7 +62,8 @@ SELECT file, row, 'n_actions', 'expected ' || len(actions) || ' actions, found '
 FROM plans WHERE n_actions <> len(actions)
 UNION ALL
 SELECT file, row, 'moved', 'expected the objects of the actions, found ' || moved::VARCHAR
-FROM plans WHERE list_sort(list_distinct(list_transform(actions, lambda a: a[2]))) <> list_sort(moved)
+FROM plans
+WHERE list_sort(list_distinct(list_transform(actions, lambda a: a[2]))) <> list_sort(moved)
 UNION ALL
 SELECT file, row, 'final', 'expected a pose for each moved object, found ' || len(final)
 FROM plans WHERE list_sort(list_transform(final, lambda f: f.name)) <> list_sort(moved)
@@ -63,7 +71,8 @@ UNION ALL
 SELECT file, row, 'reason', 'expected a reason for a goal that is not solved, found none'
 FROM plans WHERE status <> 'solved' AND reason = ''
 UNION ALL
-SELECT file, row, 'actions', 'expected no actions for a goal that is not solved, found ' || n_actions
+SELECT file, row, 'actions',
+    'expected no actions for a goal that is not solved, found ' || n_actions
 FROM plans WHERE status <> 'solved' AND n_actions > 0
 UNION ALL
 SELECT file, row, 'cost', 'expected a cost for a solved goal, found null'
@@ -74,10 +83,12 @@ SELECT file, row, 'holds' AS "column",
     'expected solved and check_ok and replay_ok is not false, found ' || holds AS message
 FROM plans WHERE holds <> (status = 'solved' AND check_ok AND coalesce(replay_ok, true))
 UNION ALL
-SELECT file, row, 'max_penetration', 'expected at most 0.001 m, found ' || coalesce(max_penetration::VARCHAR, 'null')
+SELECT file, row, 'max_penetration',
+    'expected at most 0.001 m, found ' || coalesce(max_penetration::VARCHAR, 'null')
 FROM plans WHERE holds AND coalesce(max_penetration, 1) > 0.001
 UNION ALL
-SELECT file, row, 'replay_max_penetration', 'expected at most 0.001 m, found ' || replay_max_penetration
+SELECT file, row, 'replay_max_penetration',
+    'expected at most 0.001 m, found ' || replay_max_penetration
 FROM plans WHERE replay_ok AND replay_max_penetration > 0.001;
 
 -- rule: every plan has one timing
@@ -96,7 +107,8 @@ SELECT l.file, l.row, 'plan_id', 'expected a row in plans, found none'
 FROM labels AS l ANTI JOIN plans AS p USING (plan_id)
 UNION ALL
 SELECT l.file, l.row, 'relevant',
-    l.query || ': expected ' || list_contains(p.moved, l.query) || ' as the plan says, found ' || l.relevant
+    l.query || ': expected ' || list_contains(p.moved, l.query)
+    || ' as the plan says, found ' || l.relevant
 FROM labels AS l JOIN plans AS p USING (plan_id)
 WHERE l.relevant <> list_contains(p.moved, l.query)
 UNION ALL
@@ -108,7 +120,8 @@ WHERE (l.scene_id, l.predicate, l.subject, l.reference, l.ambiguous)
 
 -- rule: a labelled plan has one label for each object
 SELECT l.file, l.row, 'query' AS "column",
-    'expected ' || s.n_objects || ' different objects for plan ' || l.plan_id || ', found ' || l.found AS message
+    'expected ' || s.n_objects || ' different objects for plan ' || l.plan_id
+    || ', found ' || l.found AS message
 FROM (
     SELECT min(file) AS file, min(row) AS row, plan_id, scene_id,
         count(*) AS labels, count(DISTINCT query) AS found
@@ -122,13 +135,15 @@ FROM plans AS p ANTI JOIN labels AS l USING (plan_id)
 WHERE p.holds AND ('labels' || substr(p.file, 6)) IN (SELECT DISTINCT file FROM labels);
 
 -- rule: predictions and evaluations are of stored scenes and known checkpoints
-SELECT p.file, p.row, 'scene_id' AS "column", 'expected a stored scene of this split, found ' || p.scene_id AS message
+SELECT p.file, p.row, 'scene_id' AS "column",
+    'expected a stored scene of this split, found ' || p.scene_id AS message
 FROM (
     SELECT file, row, scene_id, split FROM predictions
     UNION ALL SELECT file, row, scene_id, split FROM evaluations
 ) AS p ANTI JOIN scenes AS s USING (scene_id, split)
 UNION ALL
-SELECT p.file, p.row, 'checkpoint_id', 'expected a row in checkpoints, found none for ' || p.checkpoint_id
+SELECT p.file, p.row, 'checkpoint_id',
+    'expected a row in checkpoints, found none for ' || p.checkpoint_id
 FROM (
     SELECT file, min(row) AS row, checkpoint_id FROM predictions GROUP BY ALL
     UNION ALL SELECT file, min(row) AS row, checkpoint_id FROM evaluations GROUP BY ALL
@@ -136,5 +151,7 @@ FROM (
 
 -- rule: evaluations are possible
 SELECT file, row, 'seconds_guided' AS "column",
-    'expected at least seconds_inference = ' || seconds_inference || ', found ' || seconds_guided AS message
-FROM evaluations WHERE seconds_inference > seconds_guided OR least(seconds_unguided, seconds_inference) < 0;
+    'expected at least seconds_inference = ' || seconds_inference
+    || ', found ' || seconds_guided AS message
+FROM evaluations
+WHERE seconds_inference > seconds_guided OR least(seconds_unguided, seconds_inference) < 0;

@@ -5,11 +5,15 @@
 -- One row an object of a scene; place counts from 0 and mask = place + 1.
 CREATE OR REPLACE VIEW objects AS
 SELECT
-    s.scene_id, s.split, s.shard, s.family, s.n_objects,
-    (p.place - 1)::INTEGER AS place,
+    scene_id, split, shard, family, n_objects, place,
     o.name, o.size, o.position, o.yaw, o.color, o."on" AS stands_on,
     o.visible_pixels, o.visible_fraction
-FROM scenes AS s, range(1, len(s.objects) + 1) AS p (place), LATERAL (SELECT s.objects[p.place] AS o);
+FROM (
+    SELECT
+        scene_id, split, shard, family, n_objects,
+        unnest(objects) AS o, unnest(range(len(objects)))::INTEGER AS place
+    FROM scenes
+);
 
 -- How the labels of the queries (goal objects left out) are balanced.
 CREATE OR REPLACE VIEW label_balance AS

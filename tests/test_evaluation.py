@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
@@ -139,8 +140,8 @@ class Slow(NetworkScorer):
 
     def score_goals(self, scene, goals):
         if scene.id not in self._encodings:
-            end = __import__("time").process_time() + 0.1
-            while __import__("time").process_time() < end:
+            end = time.process_time() + 0.1
+            while time.process_time() < end:
                 pass
         scores = super().score_goals(scene, goals)
         scores[:] = 1.0

@@ -482,13 +482,15 @@ def _headlines(
                 continue
             counted = comparison.guide != "prune"
             interval = comparison.speedup if counted else comparison.speedup_both
+            note = f"{comparison.misses} missed" + ("" if counted else ", left out")
+            if interval.n:
+                low, high = f"{interval.low:.2f}", f"{interval.high:.2f}"
+                note = f"{low} to {high} over {interval.n} tasks, network included; {note}"
             cards.append(
                 {
-                    "value": f"{interval.value:.2f}{TIMES}",
+                    "value": f"{interval.value:.2f}{TIMES}" if interval.n else DASH,
                     "label": f"speed-up by {comparison.guide}, {comparison.search} search",
-                    "note": f"{interval.low:.2f} to {interval.high:.2f} over {interval.n} tasks, "
-                    f"network included; {comparison.misses} missed"
-                    + ("" if counted else ", left out"),
+                    "note": note,
                     "link": "#guided",
                 }
             )

@@ -73,7 +73,14 @@ def table_schema(table: str) -> TableSchema:
         raise DatasetError(f"unknown table {table!r}, expected one of {', '.join(TABLES)}")
     raw = tomllib.loads((SCHEMAS / f"{table}.toml").read_text())
     columns = tuple(
-        Column(**{**column, "fields": tuple(column.get("fields", ()))}) for column in raw["columns"]
+        Column(
+            **{
+                **column,
+                "type": column["type"].strip(),
+                "fields": tuple(column.get("fields", ())),
+            }
+        )
+        for column in raw["columns"]
     )
     with duckdb.connect() as connection:
         empty = connection.sql(f"SELECT {nulls(columns)} LIMIT 0").to_arrow_table()
