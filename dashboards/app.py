@@ -221,8 +221,9 @@ def show_speed(path: str, version: tuple[int, int], checkpoint: str | None) -> N
         show_figure(
             column,
             f"{c.guide}, {c.search} search",
-            f"{shown.value:.2f} x",
-            f"{shown.low:.2f} to {shown.high:.2f}; {c.misses} of {c.n_solvable} missed{left_out}",
+            f"{shown.value:.2f} x" if shown.n else DASH,
+            (f"{shown.low:.2f} to {shown.high:.2f}; " if shown.n else "")
+            + f"{c.misses} of {c.n_solvable} missed{left_out}",
         )
     st.dataframe(
         rows,

@@ -133,9 +133,10 @@ def _page(dataset: Dataset, checkpoint_id: str | None, examples: int) -> dict[st
         planner = _planner(rows)
         checkpoints = rows(_CHECKPOINTS)
         chosen = _choose(dataset, checkpoints, checkpoint_id)
-        pictures = draw_examples(dataset, choose_examples(rows, chosen, per_predicate=examples))
+        guided = _guided(dataset, chosen)
+        tasks = choose_examples(rows, chosen, missed=guided["misses"], per_predicate=examples)
+    pictures = draw_examples(dataset, tasks)
     model = _model(dataset, checkpoints, chosen)
-    guided = _guided(dataset, chosen)
     return {
         "name": dataset.path.resolve().name,
         "made": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),

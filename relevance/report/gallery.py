@@ -43,8 +43,18 @@ def anchor(row: Mapping[str, Any]) -> str:
     return f"task-{content_hash(task)}"
 
 
-def choose_examples(rows: Rows, checkpoint_id: str | None, *, per_predicate: int) -> list[dict]:
-    """Test tasks to show: of each predicate some with a relevant query, and what `prune` missed."""
+def choose_examples(
+    rows: Rows,
+    checkpoint_id: str | None,
+    *,
+    missed: Sequence[Mapping[str, Any]] = (),
+    per_predicate: int = 2,
+    most_missed: int = 4,
+) -> list[dict[str, Any]]:
+    """Test tasks to show: of each predicate those with most blockers, and some that were missed.
+
+    `missed` holds the evaluation rows of tasks that `prune` failed and the unguided run solved.
+    """
     wanted = rows(
         """
         with tasks as (
@@ -60,18 +70,21 @@ def choose_examples(rows: Rows, checkpoint_id: str | None, *, per_predicate: int
         """,
         per_predicate,
     )
-    missed = rows(
-        """
-        select distinct p.* from plans p join evaluations e
-            using (scene_id, predicate, subject, reference)
-        where e.checkpoint_id = ? and e.guide = 'prune' and e.beta = 0
-            and e.solved_unguided and not e.solved_guided
-        order by md5(p.plan_id) limit 4
-        """,
-        checkpoint_id,
-    )
-    notes = {anchor(row): "Missed by prune: a relevant object was left out." for row in missed}
-    chosen = {anchor(row): row for row in (*wanted, *missed)}
+    failed = {anchor(row): row for row in missed}
+    chosen = {anchor(row): row for row in wanted}
+    for row in list(failed.values())[:most_missed]:
+        task = [row[key] for key in ("scene_id", "predicate", "subject", "reference")]
+        chosen |= {
+            anchor(plan): plan
+            for plan in rows(
+                """
+                select * from plans where split = 'test' and status = 'solved'
+                    and scene_id = ? and predicate = ? and subject = ? and reference = ?
+                """,
+                *task,
+            )
+        }
+    note = "Missed by prune: a relevant object was left out."
     predictions = rows(
         """
         select scene_id, predicate, subject, reference, query, score from predictions
@@ -85,7 +98,7 @@ def choose_examples(rows: Rows, checkpoint_id: str | None, *, per_predicate: int
         scores.setdefault(anchor(row), {})[row["query"]] = row["score"]
     order = list(Predicate)
     for key, row in chosen.items():
-        row |= {"anchor": key, "note": notes.get(key, ""), "scores": scores.get(key, {})}
+        row |= {"anchor": key, "note": note if key in failed else "", "scores": scores.get(key, {})}
     return sorted(chosen.values(), key=lambda r: (bool(r["note"]), order.index(r["predicate"])))
 
 
