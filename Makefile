@@ -45,7 +45,7 @@ deploy: .venv/installed
 
 # Some Debian systems have no ensurepip; then the system's pip fills the environment.
 .venv/bin/python:
-	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed" * (sys.version_info < (3, 11)))'
+	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed")'
 	rm -rf .venv
 	$(PYTHON) -m venv .venv || ( rm -rf .venv && $(PYTHON) -m venv --without-pip .venv \
 		&& $(PYTHON) -m pip --python .venv/bin/python install --quiet pip )

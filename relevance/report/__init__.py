@@ -365,11 +365,11 @@ def _guided(dataset: Dataset, chosen: str | None) -> dict[str, Any]:
         for guide, beta in sorted(of_search, key=lambda key: (-len(of_search[key]), abs(key[1]))):
             working.setdefault(guide, of_search[guide, beta])
         found["searches"].append(_search(search, working, of_search))
-        for guide, rows in working.items():
-            found["misses"] += [
+        if search == searches[0]:
+            found["misses"] = [
                 row | {"anchor": anchor(row)}
-                for row in rows
-                if row["solved_unguided"] and not row["solved_guided"] and guide == "prune"
+                for row in working.get("prune", ())
+                if row["solved_unguided"] and not row["solved_guided"]
             ]
         found["n_tasks"] += max(map(len, working.values()))
     return found

@@ -182,7 +182,7 @@ def outlined(
                 f'<path d="{path}" fill="none" stroke="{color}" stroke-width="2" '
                 f'stroke-linejoin="round"{dashes}><title>{escape(box.name)}</title></path>'
             )
-        if goal_object:
+        if goal_object and mask.any():
             ys, xs = np.nonzero(mask)
             x, y = float(xs.mean()), float(ys.mean())
             letter = "S" if box.name == subject else "R"
