@@ -11,6 +11,7 @@ TESTS ?= tests
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+# --no-compile: byte code is made when a module is first used, which saves a minute here.
 
 .PHONY: demo test test-slow check format deploy clean
 .DELETE_ON_ERROR:
@@ -51,11 +52,11 @@ deploy: .venv/installed
 		&& $(PYTHON) -m pip --python .venv/bin/python install --quiet pip )
 
 .venv/installed: pyproject.toml | .venv/bin/python
-	$(PIP) install -e .
+	$(PIP) install --no-compile -e .
 	touch $@
 
 .venv/installed-dev: pyproject.toml | .venv/bin/python
-	$(PIP) install -e ".[dev]"
+	$(PIP) install --no-compile -e ".[dev]"
 	touch .venv/installed $@
 
 clean:

@@ -127,8 +127,12 @@ class TrainConfig:
 
     @classmethod
     def demo(cls) -> TrainConfig:
-        """About four minutes on two cores."""
-        return cls(preset="demo", steps=1000)
+        """About four minutes on two cores.
+
+        Half the usual batch learned more in the same time than twice the steps' worth of
+        scenes; exchanging colour channels changed nothing in so short a run.
+        """
+        return cls(preset="demo", steps=2000, scenes_per_batch=8, recolor=False)
 
     @classmethod
     def laptop(cls) -> TrainConfig:
