@@ -133,10 +133,11 @@ class DatasetConfig:
     def demo(cls) -> DatasetConfig:
         """Minutes: enough for a small network to learn from."""
         return cls(
-            train=Counts(same_plane=1500, on=700),
-            validation=Counts(same_plane=80, on=80),
-            test=Counts(same_plane=60, on=60),
+            train=Counts(same_plane=1300, on=1000),
+            validation=Counts(same_plane=80, on=100),
+            test=Counts(same_plane=60, on=80),
             scenes_per_shard=100,
+            goals_per_scene=2,
         )
 
     @classmethod

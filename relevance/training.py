@@ -129,8 +129,8 @@ class TrainConfig:
     def demo(cls) -> TrainConfig:
         """About four minutes on two cores.
 
-        Half the usual batch learned more in the same time than twice the steps' worth of
-        scenes; exchanging colour channels changed nothing in so short a run.
+        Twice the steps on half the usual batch learned more in the same time; exchanging colour
+        channels changed nothing in so short a run.
         """
         return cls(preset="demo", steps=2000, scenes_per_batch=8, recolor=False)
 

@@ -164,6 +164,7 @@ def _report(_: Preset) -> Callable[..., int]:
 
 def _plan(_: Preset) -> Callable[..., int]:
     from relevance.planner import PlannerConfig
+    from relevance.planner.search import Mode
     from relevance.scene import SceneError, read_scenes
 
     default = PlannerConfig()
@@ -173,7 +174,7 @@ def _plan(_: Preset) -> Callable[..., int]:
         goal: Annotated[tuple[str, ...], tyro.conf.arg(metavar="GOAL")] = (),
         json: tyro.conf.FlagCreatePairsOff[bool] = False,
         search: Literal["tree", "informed"] = "informed",
-        guide: Literal["none", "prune", "prune-then-full", "expand", "order"] = "none",
+        guide: Mode = "none",
         checkpoint: OptionalPath = None,
         beta: float = 0.0,
         limit: int = default.node_limit,
@@ -210,7 +211,11 @@ def _plan(_: Preset) -> Callable[..., int]:
             raise SceneError(f"{scenes}: no goals, expected some in the file or by --goal")
         from relevance.planner import plan
 
-        guidance = _guide(checkpoint, guide, beta) if checkpoint else None
+        guidance = None
+        if checkpoint:
+            from relevance.evaluation import load_guide
+
+            guidance = load_guide(checkpoint, mode=guide, beta=beta)
         with bar("goals", quiet=not json and sys.stdout.isatty()) as progress:
             for done, (scene, wanted) in enumerate(tasks, 1):
                 result = plan(scene, wanted, config=config, guide=guidance)
@@ -363,12 +368,6 @@ def _newest(dataset: Path) -> Path:
     if not rows:
         raise UsageError(f"{dataset}: no checkpoints there, expected `relevance train` first")
     return dataset / max(rows, key=lambda row: (row["created"], row["checkpoint_id"]))["path"]
-
-
-def _guide(checkpoint: Path, mode: str, beta: float) -> Any:
-    from relevance.evaluation import load_guide
-
-    return load_guide(checkpoint, mode=mode, beta=beta)
 
 
 def _plan_line(scene_id: str, result: Any, verdict: Any) -> dict[str, Any]:

@@ -46,8 +46,8 @@ class Native:
             self._entry = getattr(library, function.name())
         else:
             buffer, run = function.buffer()
-            buffer.set_arg(0, self.x.data)
-            buffer.set_res(0, self.y.data)
+            buffer.set_arg(0, self.x.data)  # pyright: ignore[reportCallIssue]
+            buffer.set_res(0, self.y.data)  # pyright: ignore[reportCallIssue]
             self._keep = buffer
             self._entry = _ENTRY(lambda *_: run() or 0)
         address = ctypes.cast(self._entry, ctypes.c_void_p).value
