@@ -23,13 +23,13 @@ from typing import Any, Literal
 # bring as soon as anything else runs: on two busy cores a step took 0.25 s instead of 3 s.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
-from torch import Tensor, nn  # noqa: E402
-from torch.nn import functional as F  # noqa: E402
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
 
-from relevance.sampling import camera_up  # noqa: E402
-from relevance.scene import Camera, Predicate  # noqa: E402
+from relevance.sampling import camera_up
+from relevance.scene import Camera, Predicate
 
 PATCH = 32
 """Edge of image patches and canonical views, pixels (the paper's)."""

@@ -28,6 +28,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as in `models`
+
 import numpy as np
 import torch
 from scipy.stats import rankdata
@@ -137,7 +139,7 @@ class TrainConfig:
     @classmethod
     def laptop(cls) -> TrainConfig:
         """About an hour on two cores."""
-        return cls(preset="laptop", steps=12_000)
+        return cls(preset="laptop", steps=20_000, scenes_per_batch=8)
 
     @classmethod
     def paper(cls) -> TrainConfig:

@@ -27,6 +27,8 @@ from relevance.models import (
 from relevance.sampling import project
 from relevance.scene import Box, Camera, Predicate
 
+torch.set_num_threads(1)  # threads that wait for each other crawl on a busy machine
+
 SMALL = {
     "glimpse": ModelConfig(body="glimpse", width=32, heads=2, layers=2, channels=8),
     "vit": ModelConfig(body="vit", width=32, heads=2, layers=2, hidden=24),

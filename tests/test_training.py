@@ -37,6 +37,8 @@ from relevance.training import (
     train,
 )
 
+torch.set_num_threads(1)  # threads that wait for each other crawl on a busy machine
+
 SAME_PLANE = tuple(p for p in Predicate if p is not Predicate.ON)
 DATA = DatasetConfig(
     seed=5,
