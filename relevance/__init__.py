@@ -8,6 +8,7 @@
 Names are imported when first used, so that `import relevance` stays light.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
     from relevance.planner import Guide, PlannerConfig, PlanResult, plan
     from relevance.scene import Goal, Scene, SceneError, read_scenes
     from relevance.store import Dataset
+
+# torch's threads spin while they wait unless told so before torch loads; on a shared machine
+# that made a training step four to nine times slower.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _HOMES = {
     "Dataset": "relevance.store",

@@ -14,14 +14,9 @@ Images and views are RGB. Geometry is in decimetres, so that its numbers are nea
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
-
-# Must be set before torch loads its OpenMP. Threads that wait actively cost more than they
-# bring as soon as anything else runs: on two busy cores a step took 0.25 s instead of 3 s.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import torch
