@@ -397,10 +397,14 @@ def scene_from_json(text: str | bytes, *, where: str = "scene") -> Scene:
     try:
         return _SCENE.validate_json(text)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
+        errors = error.errors(include_url=False)
+        # A misspelt field is missing and unknown at once: the unknown one says more.
+        first = next((e for e in errors if e["type"] == "unexpected_keyword_argument"), errors[0])
         field = ".".join(str(part) for part in first["loc"])
         found = first["input"] if isinstance(first["input"], str | int | float) else None
         message = first["msg"].removeprefix("Value error, ")
+        if first["type"] == "unexpected_keyword_argument":
+            message = "unknown field"
         text = ": ".join(part for part in (where, field, message) if part)
         if found is not None and repr(found) not in text:
             text += f" (found {found!r})"
