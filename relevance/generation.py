@@ -25,7 +25,7 @@ from relevance.labels import (
     stored_scene,
     timing_row,
 )
-from relevance.planner import PLANNER_VERSION, PlannerConfig, plan
+from relevance.planner import PLANNER_VERSION, PlannerConfig, plan, warm_up
 from relevance.sampling import SceneConfig, sample_goals, sample_scene
 from relevance.scene import FAMILIES, Predicate, Scene, content_hash, scene_to_json
 from relevance.simulation import Renderer, Rendering, rejects, replay
@@ -432,6 +432,7 @@ def _plans(
     plans: list[dict[str, Any]] = []
     timings: list[dict[str, Any]] = []
     config_hash = config.plans_hash
+    warm_up()
     for done, row in enumerate(rows, 1):
         scene = stored_scene(row)
         share = config.test_replay_share if row["split"] == "test" else config.replay_share

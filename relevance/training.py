@@ -546,6 +546,8 @@ def accuracy(score: np.ndarray, relevant: np.ndarray) -> dict[str, float | int |
 
     `base_rate` is what always answering irrelevant gets right, `balanced` the mean of true
     relevant and true irrelevant, `auc` the chance that a relevant object outscores another.
+    `best_beta` has the highest total here (an object is kept iff score > -beta); eta makes
+    beta = 0 lean towards keeping.
     """
     kept, n, k = score > 0, len(score), int(relevant.sum())
 
@@ -565,4 +567,21 @@ def accuracy(score: np.ndarray, relevant: np.ndarray) -> dict[str, float | int |
         "auc": float((rankdata(score)[relevant].sum() - k * (k + 1) / 2) / (k * (n - k)))
         if both
         else None,
+        "best_beta": _best_beta(score, relevant),
     }
+
+
+def _best_beta(score: np.ndarray, relevant: np.ndarray) -> float | None:
+    """The beta half-way between the scores where most objects are judged rightly."""
+    if not len(score):
+        return None
+    order = np.argsort(-score, kind="stable")
+    ranked = np.r_[np.inf, score[order], -np.inf]
+    gained = np.r_[0, np.cumsum(np.where(relevant[order], 1, -1))]
+    # Objects of equal score are kept together.
+    splits = ranked[:-1] > ranked[1:]
+    best = int(np.argmax(np.where(splits, gained, -len(score))))
+    above, below = ranked[best], ranked[best + 1]
+    if np.isinf(above) or np.isinf(below):
+        return float(-below - 1.0) if np.isinf(above) else float(-above + 1.0)
+    return float(-(above + below) / 2)

@@ -225,6 +225,27 @@ def test_robot_pose_moves_with_the_scene():
     assert replay(turned, there.goal, there.phases).ok
 
 
+def test_carried_box_stays_clear_of_the_robots_foot():
+    """A task whose motion once swung the box through the foot of the arm."""
+    rows = [
+        ("crimson", (0.0644, 0.0858, 0.0682), 0.1556, 0.0312, 1.2485),
+        ("teal", (0.0487, 0.0807, 0.067), -0.0725, 0.1402, 0.1709),
+        ("olive", (0.0643, 0.0656, 0.0476), 0.1882, -0.1277, -0.0394),
+        ("red", (0.0755, 0.0403, 0.1028), 0.0411, 0.0179, 1.8658),
+        ("magenta", (0.0766, 0.0665, 0.0875), 0.0387, 0.1419, -0.1561),
+        ("orange", (0.0425, 0.0496, 0.0413), 0.1428, 0.133, -0.0606),
+        ("lime", (0.0487, 0.0449, 0.0712), -0.0797, 0.2537, 0.1293),
+        ("navy", (0.1149, 0.0543, 0.0976), -0.1789, 0.1613, 1.827),
+        ("violet", (0.0609, 0.104, 0.0683), 0.0532, -0.1118, 1.3541),
+        ("maroon", (0.0461, 0.053, 0.0845), 0.0347, -0.1976, -0.7504),
+    ]
+    boxes = [box(name, x, y, GREY, size=size, yaw=yaw) for name, size, x, y, yaw in rows]
+    scene = Scene(objects=tuple(boxes))
+    result = plan(scene, "in-front(navy, olive)")
+    assert result.status == "solved"
+    assert replay(scene, result.goal, result.phases).ok
+
+
 def standable(scene: Scene, goal: Goal, gone: set[str]) -> bool:
     """Brute force: some grid pose of the subject in the goal region is reachable and free."""
     boxes = {b.name: b for b in scene.objects}

@@ -480,6 +480,11 @@ def test_accuracy_by_hand() -> None:
 
 
 def test_accuracy_of_one_class_or_of_nothing_has_no_balance() -> None:
+    separable = accuracy(np.array([-1.0, 3.0, 2.0, -4.0]), np.array([False, True, True, False]))
+    assert separable["best_beta"] == pytest.approx(-0.5)
+    none = accuracy(np.array([1.0, 2.0]), np.array([False, False]))
+    assert none["best_beta"] is not None
+    assert none["best_beta"] < -2.0
     assert accuracy(np.array([1.0]), np.array([True]))["balanced"] is None
     assert accuracy(np.array([1.0]), np.array([True]))["auc"] is None
     assert accuracy(np.zeros(0), np.zeros(0, bool))["total"] is None

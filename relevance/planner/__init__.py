@@ -9,6 +9,7 @@ from relevance.planner.search import (
     PlanResult,
     Scorer,
     plan,
+    warm_up,
 )
 
 __all__ = [
@@ -21,4 +22,5 @@ __all__ = [
     "Scorer",
     "Seconds",
     "plan",
+    "warm_up",
 ]

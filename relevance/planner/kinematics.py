@@ -44,6 +44,8 @@ class Panda:
     """(7,) rad/s."""
     arm: tuple[tuple[int, np.ndarray, np.ndarray], ...]
     """Boxes around links: (index in LINKS, centre (3,), half extents (3,)) in that link's frame."""
+    foot: tuple[np.ndarray, np.ndarray]
+    """Box (centre, half extents) around the link that does not move, in the base's frame."""
     finger: tuple[tuple[np.ndarray, np.ndarray], ...]
     """Boxes (low corner, high corner) of the left finger at opening 0, in the hand's frame."""
     finger_tip: float
@@ -126,6 +128,7 @@ def panda() -> Panda:
         upper=bounds[:, 1],
         velocity=bounds[:, 2],
         arm=arm,
+        foot=_box(_vertices(meshes / "link0.obj")),
         finger=(_slice(finger, middle, np.inf), _slice(finger, -np.inf, middle)),
         finger_tip=float(finger[:, 2].max()),
         palm=float(_vertices(meshes / "hand.obj")[:, 2].max()),

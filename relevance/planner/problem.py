@@ -269,8 +269,8 @@ class Problem:
     def _solve_keyframes(self, order, placements):
         arm, m = panda(), len(order)
         names = list(self.boxes)
-        obstacles = np.array([placement.obstacle(b) for b in self.boxes.values()] + [self.table()])
-        moved = np.array([order.index(n) if n in order else -1 for n in names] + [-1])
+        obstacles = np.array([placement.obstacle(b) for b in self.boxes.values()] + self.fixtures())
+        moved = np.array([order.index(n) if n in order else -1 for n in names] + [-1, -1])
         stands = np.ones((2 * m, len(obstacles)), np.bool_)
         supports = np.full(m, len(names))
         widest = len(arm.arm) + 2 * len(arm.finger) + 1
@@ -329,9 +329,14 @@ class Problem:
                 return x[: 14 * m].reshape(2 * m, ARM), x[14 * m :].reshape(m, 3)
         return None
 
-    def table(self) -> np.ndarray:
-        """The table as an obstacle."""
-        return np.array([0, 0, -0.05, 0, *(edge / 2 for edge in self.scene.table.size), 0.05])
+    def fixtures(self) -> list[np.ndarray]:
+        """What always stands there, as obstacles: the table (first) and the robot's foot."""
+        table = np.array([0, 0, -0.05, 0, *(edge / 2 for edge in self.scene.table.size), 0.05])
+        centre, half = panda().foot
+        c, s = math.cos(self.base[3]), math.sin(self.base[3])
+        x = self.base[0] + c * centre[0] - s * centre[1]
+        y = self.base[1] + s * centre[0] + c * centre[1]
+        return [table, np.array([x, y, self.base[2] + centre[2], self.base[3], *half])]
 
     def pick_target(self, box: Box, grasp: Grasp) -> np.ndarray:
         """Hand target (x, y, z, finger angle) over a standing box."""
@@ -371,7 +376,7 @@ class Problem:
                 if carried is not None:
                     del standing[name]
                 obstacles = np.array(
-                    [placement.obstacle(b) for b in standing.values()] + [self.table()]
+                    [placement.obstacle(b) for b in standing.values()] + self.fixtures()
                 )
                 opening = grasp.closed if carried is not None else grasp.opening
                 body = keyframes.bodies(arm, opening, carried)
@@ -418,7 +423,7 @@ class Problem:
 
     def _check(self, X: np.ndarray, body: keyframes.Bodies, standing: dict[str, Box]) -> float:
         arm = panda()
-        obstacles = np.array([placement.obstacle(b) for b in standing.values()] + [self.table()])
+        obstacles = np.array([placement.obstacle(b) for b in standing.values()] + self.fixtures())
         margin = np.zeros((len(body.link), len(obstacles)))
         return path.dense_check(
             X, self.base, body.link, body.centre, body.half, obstacles, margin, arm.frames.x,

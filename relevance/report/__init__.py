@@ -318,6 +318,7 @@ def _model(
         "chosen": next((row for row in checkpoints if row["checkpoint_id"] == chosen), None),
         "accuracies": [],
         "with_goal_objects": [],
+        "tuned": {},
         "n_tasks": 0,
         "plots": {},
     }
@@ -330,6 +331,7 @@ def _model(
     groups = [g for g in ("same-plane", *PREDICATES) if len(predictions.of(g))]
     model["accuracies"] = [(group, predictions.of(group).accuracy()) for group in groups]
     model["with_goal_objects"] = [(group, everything.of(group).accuracy()) for group in groups]
+    model["tuned"] = _tuned(predictions, groups, model["chosen"])
     model["n_tasks"] = len(np.unique(predictions.task))
     model["plots"] |= {
         "accuracy": plots.svg("accuracy", plots.accuracy, size=(4.8, 3.8), predictions=predictions),
@@ -341,6 +343,19 @@ def _model(
         ),
     }
     return model
+
+
+def _tuned(
+    predictions: Predictions, groups: Sequence[str], chosen: Mapping[str, Any] | None
+) -> dict[str, tuple[float, Accuracy]]:
+    """By group: the beta with the highest total on validation, and what it gives on test."""
+    metrics = json.loads(chosen["metrics"]) if chosen else {}
+    found = {}
+    for group in groups:
+        beta = metrics.get(group, {}).get("queries", {}).get("best_beta")
+        if beta is not None:
+            found[group] = (beta, predictions.of(group).accuracy(beta))
+    return found
 
 
 def _history(dataset: Dataset, chosen: Mapping[str, Any] | None) -> list[dict[str, float]]:
@@ -466,13 +481,15 @@ def _headlines(
                 "link": "#planner",
             }
         )
-    for group, accuracy in model["accuracies"]:
+    for group, plain in model["accuracies"]:
         if group in GROUPS:
+            beta, accuracy = model["tuned"].get(group, (0.0, plain))
             cards.append(
                 {
                     "value": percent(accuracy.total),
                     "label": f"accuracy, {group}",
                     "note": f"base rate {percent(accuracy.base_rate)}; {accuracy.n_tasks} tasks; "
+                    f"beta {beta:.1f} from validation, {percent(plain.total)} at beta 0; "
                     f"paper: {percent(PAPER_ACCURACY[group][2], 0)}",
                     "link": "#model",
                 }

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import math
 import re
+import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -178,7 +179,7 @@ def reasons(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     ax.barh(y, counts, height=0.56, color="#9aa4af")
     for at, count in zip(y, counts, strict=True):
         ax.text(count + max(counts) * 0.01, at, str(count), va="center", fontsize=8.5)
-    ax.set_yticks(y, [row["label"] for row in rows])
+    ax.set_yticks(y, [textwrap.fill(row["label"], 26) for row in rows])
     ax.set_xlim(0, max(counts) * 1.12)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.grid(axis="y", visible=False)
