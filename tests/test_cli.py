@@ -274,7 +274,12 @@ def test_an_interrupted_run_is_tidy_and_goes_on(tmp_path: Path) -> None:
         "--workers=1",
     ]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        # a background job of a plain shell is born deaf to SIGINT, and so are its children
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     end = time.monotonic() + 120
     while not [*root.glob("scenes/*/*.parquet")]:

@@ -17,6 +17,7 @@ from relevance.generation import describe
 from relevance.report import build, figures, gallery, plots
 from relevance.report.gallery import KEPT, LOST, RELEVANT, outlined
 from relevance.store import Dataset, DatasetError
+from relevance.training import load_checkpoint
 
 VOID = {"meta", "link", "br", "img", "hr", "path", "use", "rect"}
 
@@ -107,10 +108,14 @@ def test_the_whole_page_says_what_the_rows_say() -> None:
     page = whole(page_of_everything())
     dataset = Dataset.open(root)
     predictions = figures.read_predictions(dataset, checkpoint.stem).queries()
+    metrics = load_checkpoint(checkpoint)[1]["metrics"]
     for group, paper in (("same-plane", "94%"), ("on", "87%")):
-        found = predictions.of(group).accuracy()
+        plain = predictions.of(group).accuracy()
+        beta = metrics[group]["queries"]["best_beta"]
+        found = predictions.of(group).accuracy(beta)
         card = f"{100 * found.total:.1f}% accuracy, {group} base rate {100 * found.base_rate:.1f}%"
-        assert f"{card}; {found.n_tasks} tasks; paper: {paper}" in page.text
+        tuned = f"beta {beta:.1f} from validation, {100 * plain.total:.1f}% at beta 0"
+        assert f"{card}; {found.n_tasks} tasks; {tuned}; paper: {paper}" in page.text
     rows = figures.settings(figures.read_evaluations(dataset, checkpoint.stem))
     whole_guide = figures.summarise(rows["tree", "prune-then-full", 0.0])
     assert f"{whole_guide.speedup.value:.2f}{plots.TIMES} speed-up by prune-then-full" in page.text
