@@ -138,7 +138,8 @@ class Renderer:
             mask=mask,
             views=np.stack(views),
             visible_pixels=visible,
-            visible_fraction=visible / np.maximum(alone, 1),
+            # `alone` is computed, not rendered: a pixel of rounding may make it the smaller one.
+            visible_fraction=np.minimum(visible / np.maximum(alone, 1), 1.0),
         )
 
     def _create(self, box: Box) -> int:
