@@ -20,7 +20,6 @@ from functools import cache
 from typing import Literal, Protocol
 
 from relevance.planner import logic
-from relevance.planner.placement import obstacle
 from relevance.planner.problem import Counts, Motion, Problem, Seconds
 from relevance.scene import Action, Box, Goal, Phase, Pose, Scene, footprint_gap, goal_holds
 
@@ -327,11 +326,7 @@ def could_matter(problem: Problem) -> frozenset[str]:
             yaw=angle,
             color=(0.0, 0.0, 0.0),
         )
-        found |= {
-            box.name
-            for box in problem.scene.objects
-            if footprint_gap(area, box) <= 0 and obstacle(box)[2] > 0
-        }
+        found |= {box.name for box in problem.scene.objects if footprint_gap(area, box) <= 0}
     while True:
         more = set(found)
         for name in found:
