@@ -10,9 +10,23 @@ from hypothesis import strategies as st
 
 from relevance.planner import keyframes, path, placement
 from relevance.planner.kernels import native
-from relevance.planner.kernels.boxes import banded_solve, rectangle_gap, separation
+from relevance.planner.kernels.boxes import (
+    UPRIGHT,
+    banded_solve,
+    rectangle_gap,
+    separation,
+    upright,
+)
 from relevance.planner.kernels.native import call
-from relevance.planner.kinematics import ARM, FRAME, LINKS, hand_down, panda, reach_interval
+from relevance.planner.kinematics import (
+    ARM,
+    FRAME,
+    LINKS,
+    arm_at,
+    hand_down,
+    panda,
+    reach_interval,
+)
 from relevance.planner.placement import FOUND, NONE
 from relevance.scene import Box
 from relevance.simulation import panda_urdf
@@ -25,6 +39,14 @@ def frames_at(q, base=BASE):
     arm.frames.x[:] = np.r_[q, base]
     call(arm.frames.handle)
     return arm.frames.y.copy().reshape(len(LINKS), FRAME)
+
+
+def obstacle_rows(numbers):
+    """Obstacle rows of (x, y, z, yaw, half extents) rows."""
+    rows = np.empty((len(numbers), UPRIGHT))
+    for row, given_row in zip(rows, np.asarray(numbers, float), strict=True):
+        upright(*given_row, row)
+    return rows
 
 
 def random_q(rng):
@@ -125,7 +147,7 @@ def test_hand_down_solves_the_grasp_exactly():
 
 def test_reach_interval_is_what_hand_down_reaches():
     arm, q = panda(), np.zeros(7)
-    near, far = reach_interval(0.15, BASE, arm.lower, arm.upper)
+    near, far = reach_interval(0.15)
     assert 0.15 < near < 0.35 < 0.7 < far < 0.9
     for r, expected in ((far - 0.003, True), (far + 0.003, False), (near + 0.003, True)):
         target = np.array([BASE[0] + r, 0.0, 0.15, 0.3])
@@ -160,7 +182,8 @@ def test_rectangle_gap_bounds_sampled_distance(x, y, a, hx, hy, b, gx, gy):
         c, s = math.cos(yaw), math.sin(yaw)
         return edge @ np.array([[c, s], [-s, c]]) + [cx, cy]
 
-    gap = rectangle_gap(0.0, 0.0, a, hx, hy, x, y, b, gx, gy)
+    ca, sa, cb, sb = math.cos(a), math.sin(a), math.cos(b), math.sin(b)
+    gap = rectangle_gap(0.0, 0.0, ca, sa, hx, hy, x, y, cb, sb, gx, gy)
     P, Q = boundary(0, 0, a, hx, hy), boundary(x, y, b, gx, gy)
     distance = np.linalg.norm(P[:, None] - Q[None], axis=2).min()
     if gap > 0:
@@ -186,18 +209,18 @@ def test_separation_gradient_equals_finite_differences():
         p, half = rng.uniform(-0.15, 0.15, 3), rng.uniform(0.01, 0.05, 3)
         R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         obstacle = np.r_[rng.uniform(-0.1, 0.1, 3), rng.uniform(-3, 3), rng.uniform(0.02, 0.06, 3)]
-        d = separation(p, R, half, obstacle, n, x)
+        row = obstacle_rows([obstacle])[0]
+        d = separation(p, R, half, row, n, x)
         grad_v, grad_w = n.copy(), np.cross(x - p, n)
         o_v, o_w = -n.copy(), -np.cross(x - obstacle[:3], n)[2]
         unused = scratch.copy()
         numeric_v = [
-            (separation(p + h * e, R, half, obstacle, scratch, unused) - d) / h for e in np.eye(3)
+            (separation(p + h * e, R, half, row, scratch, unused) - d) / h for e in np.eye(3)
         ]
         numeric_w = [
-            (separation(p, turned(R, h * e), half, obstacle, scratch, unused) - d) / h
-            for e in np.eye(3)
+            (separation(p, turned(R, h * e), half, row, scratch, unused) - d) / h for e in np.eye(3)
         ]
-        moved = [obstacle + h * np.eye(7)[i] for i in range(4)]
+        moved = obstacle_rows([obstacle + h * np.eye(7)[i] for i in range(4)])
         numeric_o = [(separation(p, R, half, o, scratch, unused) - d) / h for o in moved]
         np.testing.assert_allclose(numeric_v, grad_v, atol=1e-5)
         np.testing.assert_allclose(numeric_w, grad_w, atol=1e-4)
@@ -211,7 +234,7 @@ def test_banded_solve_equals_dense():
     L = np.tril(rng.normal(size=(n, n)))
     L[np.subtract.outer(np.arange(n), np.arange(n)) >= width] = 0
     A, b = L @ L.T + np.eye(n), rng.normal(size=n)
-    band = np.array([[A[i, i - d] if i >= d else 0.0 for d in range(width)] for i in range(n)])
+    band = np.array([[A[j + d, j] if j + d < n else 0.0 for d in range(width)] for j in range(n)])
     x = b.copy()
     assert banded_solve(band, x)
     np.testing.assert_allclose(x, np.linalg.solve(A, b), atol=1e-9)
@@ -221,7 +244,7 @@ def test_banded_solve_equals_dense():
 def test_path_gradient_equals_finite_differences():
     arm, rng = panda(), np.random.default_rng(6)
     body = keyframes.bodies(arm, 0.03)
-    obstacles = np.array(
+    obstacles = obstacle_rows(
         [[0.1, 0.0, 0.06, 0.3, 0.05, 0.04, 0.06], [0, 0, -0.05, 0, 0.4, 0.6, 0.05]]
     )
     X = np.zeros((7, ARM))
@@ -235,12 +258,12 @@ def test_path_gradient_equals_finite_differences():
     multipliers = rng.uniform(0, 0.1, (7, 6)), rng.uniform(0, 0.1, shape), np.zeros((7, ARM, 2))
     margin = np.full(shape[1:], 0.05)
     band, g = np.zeros((5 * ARM, 3 * ARM)), np.zeros(5 * ARM)
+    at, smooth = arm_at(BASE), path.smoothness(6)
 
     def merit(rows):
-        return path._assemble(
-            rows, BASE, arm.lower, arm.upper, body.link, body.centre, body.half, obstacles, margin,
-            samples, len(samples), targets, arm.frames.x, arm.frames.y, arm.frames.handle,
-            arm.grasp.x, arm.grasp.y, arm.grasp.handle, *multipliers, 7.0, False, band, g,
+        return path.assemble(
+            rows, at, body, obstacles, margin, samples, len(samples), targets, smooth, *multipliers,
+            7.0, False, band, g,
         )[0]  # fmt: skip
 
     merit(X)
@@ -254,20 +277,60 @@ def test_path_gradient_equals_finite_differences():
     np.testing.assert_allclose(gradient, numeric, atol=2e-4)
 
 
+def test_smoothness_is_the_hessian_of_the_cost():
+    T = 6
+    n = (T - 1) * ARM
+    second = np.kron(np.diff(np.eye(T + 3), n=2, axis=0)[:, 2:-2], np.eye(ARM))
+    expected = second.T @ second + 1e-6 * np.eye(n)
+    band = path.smoothness(T)
+    found = np.zeros((n, n))
+    for j in range(n):
+        for d in range(min(3 * ARM, n - j)):
+            found[j + d, j] = found[j, j + d] = band[j, d]
+    np.testing.assert_allclose(found, expected)
+
+
+def test_steps_called_clear_are_clear_at_every_substep():
+    """The dense check skips steps by a bound on the motion; sampled finely, none comes close."""
+    arm, at, rng = panda(), arm_at(BASE), np.random.default_rng(8)
+    body = keyframes.bodies(arm, 0.03, (np.array([0, 0, 0.12]), np.array([0.03, 0.02, 0.05])))
+    obstacles = obstacle_rows(
+        [[0.1, 0.0, 0.06, 0.3, 0.05, 0.04, 0.06], [0, 0, -0.05, 0, 0.4, 0.6, 0.05]]
+    )
+    out, clear, q = np.zeros((len(body.link), len(obstacles))), 0, np.zeros(ARM)
+    while clear < 100:
+        target = np.r_[rng.uniform(-0.2, 0.2, 2), rng.uniform(0.15, 0.4), rng.uniform(-3, 3)]
+        if not hand_down(target, BASE, arm.lower, arm.upper, q):
+            continue
+        step = rng.normal(scale=0.08, size=ARM)
+        if not path._clear(at, q, q + step, body, obstacles):
+            continue
+        clear += 1
+        for share in np.linspace(0, 1, 21):
+            path.distances(at, q + share * step, body, obstacles, out)
+            assert out.min() >= path.CLEARANCE
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_pose_bound_never_refuses_what_a_grid_finds(seed):
-    rng, arm = np.random.default_rng(seed), panda()
+    rng = np.random.default_rng(seed)
     table, refused, found = np.array([0.4, 0.6]), 0, 0
     for _ in range(60):
         size = rng.uniform(0.04, 0.07, 3)
         box = Box(name="b", size=tuple(size), position=(0, 0, size[2] / 2), color=(1, 0, 0))
         grasp = placement.grasps(box)[0]
         count = rng.integers(3, 9)
-        obstacles = np.c_[rng.uniform(-0.12, 0.12, (count, 2)), np.full(count, 0.04),
-                          rng.uniform(-3, 3, count), rng.uniform(0.02, 0.05, (count, 2)),
-                          np.full(count, 0.04)]  # fmt: skip
+        obstacles = obstacle_rows(
+            np.c_[
+                rng.uniform(-0.12, 0.12, (count, 2)),
+                np.full(count, 0.04),
+                rng.uniform(-3, 3, count),
+                rng.uniform(0.02, 0.05, (count, 2)),
+                np.full(count, 0.04),
+            ]
+        )
         region = np.array([0.0, 0.0, 0.2, 0.05, 0.03])
-        near, far = reach_interval(0.15, BASE, arm.lower, arm.upper)
+        near, far = reach_interval(0.15)
         pose = np.zeros(3)
         common = (0.0, grasp.parts, obstacles, table, BASE, near, far)
         status, _ = placement.find_pose(region, np.zeros(2), *common, pose)

@@ -12,14 +12,22 @@ Variables: q (2m, 7), one per switch (pick and place of each of m moved boxes in
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from relevance.planner.kernels.boxes import dense_solve, near, separation
-from relevance.planner.kernels.native import call
-from relevance.planner.kinematics import ARM, FRAME, HAND, Panda
+from relevance.planner.kernels.boxes import (
+    UPRIGHT,
+    Bodies,
+    body_pose,
+    dense_solve,
+    near,
+    point_gradient,
+    separation,
+    upright,
+)
+from relevance.planner.kinematics import ARM, FRAME, HAND, Panda, look_at_frames, look_at_grasp
 
 CLEARANCE = 0.0025
 """Clearance asked of every pair at a switch, m (the pose bound's MARGIN is larger)."""
@@ -28,19 +36,41 @@ TOLERANCE = 2e-4
 STAY = (100.0, 1e5)
 """Weights of a placement's distance from what the pose bound found (m^-2), tried in turn: with
 less, the pull of short joint motion drags boxes into wells between obstacles."""
+SMALL_STEP = 1e-3
+"""Gauss-Newton stops after a step below this, rad or m; what is left is of the order of its
+square."""
 _OUTER, _INNER = 8, 12
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Bodies:
-    """Boxes that move with the arm during one motion, each aligned with its link's axes."""
+class Switches(NamedTuple):
+    """The switches of m moved boxes among W obstacles: what the NLP is about besides the arm."""
 
+    start: np.ndarray
+    """(7,) configuration before the first switch, rad."""
+    pick: np.ndarray
+    """(m, 4) hand target (x, y, z, finger angle) of each pick."""
+    place_z: np.ndarray
+    """(m,) height of the hand at each place, m."""
+    turn: np.ndarray
+    """(m, 2): angle of the finger axis minus the box's yaw, and the placed box's height."""
     link: np.ndarray
-    """(B,) index in LINKS."""
+    """(2m, B) bodies at each switch, as in `Bodies`; the first n_bodies[k] count."""
     centre: np.ndarray
-    """(B, 3) in the link's frame, m."""
     half: np.ndarray
-    """(B, 3) m."""
+    radius: np.ndarray
+    n_bodies: np.ndarray
+    obstacles: np.ndarray
+    """(W, UPRIGHT)."""
+    stands: np.ndarray
+    """(2m, W): whether obstacle w is there at switch k and is not the box in hand."""
+    moved: np.ndarray
+    """(W,) index of the obstacle among the moved boxes, or -1."""
+    support: np.ndarray
+    """(m,) obstacle on which box j is placed."""
+    region: np.ndarray
+    """(5,) goal region of the last box's centre: x, y, angle, half extents."""
+    table: np.ndarray
+    """(m, 2) bounds of |x| and |y| of each placement."""
 
 
 def bodies(arm: Panda, opening: float, carried: tuple | None = None) -> Bodies:
@@ -54,37 +84,13 @@ def bodies(arm: Panda, opening: float, carried: tuple | None = None) -> Bodies:
             )
     if carried is not None:
         rows.append((HAND, *carried))
+    half = np.array([row[2] for row in rows])
     return Bodies(
         link=np.array([row[0] for row in rows]),
         centre=np.array([row[1] for row in rows]),
-        half=np.array([row[2] for row in rows]),
+        half=half,
+        radius=np.sqrt((half**2).sum(1)),
     )
-
-
-@njit(cache=True)
-def body_pose(frame, centre, p, R):
-    """World centre p (3,) and axes R (3, 3) of a body, from its link's frame (FRAME,)."""
-    for i in range(3):
-        for j in range(3):
-            R[i, j] = frame[3 + 3 * i + j]
-        p[i] = frame[i] + R[i, 0] * centre[0] + R[i, 1] * centre[1] + R[i, 2] * centre[2]
-
-
-@njit(cache=True)
-def point_gradient(frame, point, n, row):
-    """Gradient (7,) of n . (velocity of a point fixed to the link) with respect to q."""
-    rx, ry, rz = point[0] - frame[0], point[1] - frame[1], point[2] - frame[2]
-    # n . (w x r) = w . (r x n)
-    mx, my, mz = ry * n[2] - rz * n[1], rz * n[0] - rx * n[2], rx * n[1] - ry * n[0]
-    for i in range(ARM):
-        row[i] = (
-            n[0] * frame[12 + i]
-            + n[1] * frame[19 + i]
-            + n[2] * frame[26 + i]
-            + mx * frame[33 + i]
-            + my * frame[40 + i]
-            + mz * frame[47 + i]
-        )
 
 
 @njit(cache=True)
@@ -95,30 +101,28 @@ def _push(H, g, index, row, count, value, multiplier, mu, equality):
         return 0.0, max(value, 0.0)
     for a in range(count):
         g[index[a]] += mu * shifted * row[a]
-        for b in range(count):
+        for b in range(a + 1):  # indices ascend: the lower triangle
             H[index[a], index[b]] += mu * row[a] * row[b]
     return 0.5 * mu * shifted * shifted, abs(value) if equality else max(value, 0.0)
 
 
 @njit(cache=True)
-def _assemble(
-    x, m, start, p0, weight, pick_target, place_z, turn, base, lower, upper, link, centre, half,
-    n_bodies, obstacles, stands, moved, support, region, table, frames_x, frames_y, frames_f,
-    grasp_x, grasp_y, grasp_f, eq, ineq, limit, edge, mu, update, H, g,
-):  # fmt: skip
-    """Merit, and H, g of the Gauss-Newton model; with `update`, new multipliers instead."""
-    n, first = len(x), 2 * m * ARM
+def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, update, H, g):
+    """Merit, violation; g, H (lower triangle) of the model; with `update`, new multipliers."""
+    n, m = len(x), len(switches.place_z)
+    first = 2 * m * ARM
+    obstacles, region = switches.obstacles, switches.region
     merit, worst = 0.0, 0.0
     H[:, :] = 0.0
     g[:] = 0.0
     index = np.zeros(16, np.int64)
     row, part = np.zeros(16), np.zeros(ARM)
     p, R, normal, contact = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
-    o = np.zeros(7)
+    o, target = np.zeros(UPRIGHT), np.zeros(4)
     for k in range(2 * m):
         for i in range(ARM):
             a = k * ARM + i
-            before = start[i] if k == 0 else x[a - ARM]
+            before = switches.start[i] if k == 0 else x[a - ARM]
             d = x[a] - before
             merit += 0.5 * d * d
             g[a] += d
@@ -127,7 +131,6 @@ def _assemble(
                 g[a - ARM] -= d
                 H[a - ARM, a - ARM] += 1.0
                 H[a, a - ARM] -= 1.0
-                H[a - ARM, a] -= 1.0
     for i in range(3 * m):
         d = x[first + i] - p0[i]
         merit += 0.5 * weight[i] * d * d
@@ -136,31 +139,24 @@ def _assemble(
     for k in range(2 * m):
         j, placing = k // 2, k % 2 == 1
         at = first + 3 * j
-        for i in range(ARM):
-            frames_x[i] = grasp_x[i] = x[k * ARM + i]
-        for i in range(4):
-            frames_x[ARM + i] = grasp_x[ARM + i] = base[i]
         if placing:
-            grasp_x[11], grasp_x[12], grasp_x[13], grasp_x[14] = (
-                x[at],
-                x[at + 1],
-                place_z[j],
-                x[at + 2],
-            )
+            target[0], target[1] = x[at], x[at + 1]
+            target[2], target[3] = switches.place_z[j], x[at + 2]
         else:
-            for i in range(4):
-                grasp_x[11 + i] = pick_target[j, i]
-        call(grasp_f)
-        call(frames_f)
+            target[:] = switches.pick[j]
+        q = x[k * ARM : (k + 1) * ARM]
+        look_at_grasp(arm, q, target)
+        look_at_frames(arm, q)
         for r in range(6):
             for i in range(ARM):
-                index[i], row[i] = k * ARM + i, grasp_y[6 + r * ARM + i]
+                index[i], row[i] = k * ARM + i, arm.grasp_y[6 + r * ARM + i]
             count = ARM
             if placing:
                 for i in range(3):
-                    index[count], row[count] = at + i, grasp_y[48 + r * 4 + (3 if i == 2 else i)]
+                    index[count] = at + i
+                    row[count] = arm.grasp_y[48 + r * 4 + (3 if i == 2 else i)]
                     count += 1
-            value = grasp_y[r]
+            value = arm.grasp_y[r]
             if update:
                 eq[k, r] += mu * value
             got, violated = _push(H, g, index, row, count, value, eq[k, r], mu, True)
@@ -168,30 +164,32 @@ def _assemble(
             worst = max(worst, violated)
         for i in range(ARM):
             for side in range(2):
-                value = lower[i] - x[k * ARM + i] if side == 0 else x[k * ARM + i] - upper[i]
+                value = arm.lower[i] - q[i] if side == 0 else q[i] - arm.upper[i]
                 index[0], row[0] = k * ARM + i, (-1.0 if side == 0 else 1.0)
                 if update:
                     limit[k, i, side] = max(0.0, limit[k, i, side] + mu * value)
                 got, violated = _push(H, g, index, row, 1, value, limit[k, i, side], mu, False)
                 merit += got
                 worst = max(worst, violated)
-        for b in range(n_bodies[k]):
-            frame = frames_y[link[k, b] * FRAME : (link[k, b] + 1) * FRAME]
-            body_pose(frame, centre[k, b], p, R)
+        for b in range(switches.n_bodies[k]):
+            link = switches.link[k, b] * FRAME
+            frame = arm.frames_y[link : link + FRAME]
+            body_pose(frame, switches.centre[k, b], p, R)
             for w in range(len(obstacles)):
-                if not stands[k, w] or (placing and b == n_bodies[k] - 1 and w == support[j]):
+                held = b == switches.n_bodies[k] - 1
+                if not switches.stands[k, w] or (placing and held and w == switches.support[j]):
                     continue
                 o[:] = obstacles[w]
-                other = moved[w]
+                other = switches.moved[w]
                 free = other >= 0 and other < j
                 if free:
                     there = first + 3 * other
-                    o[0], o[1] = x[there], x[there + 1]
-                    o[2] = turn[other, 1]
-                    o[3] = x[there + 2] - turn[other, 0]
-                if ineq[k, b, w] == 0.0 and not near(p, half[k, b], o, 0.03):
+                    yaw = x[there + 2] - switches.turn[other, 0]
+                    height = switches.turn[other, 1]
+                    upright(x[there], x[there + 1], height, yaw, o[4], o[5], o[6], o)
+                if ineq[k, b, w] == 0.0 and not near(p, switches.radius[k, b] + CLEARANCE, o):
                     continue
-                d = separation(p, R, half[k, b], o, normal, contact)
+                d = separation(p, R, switches.half[k, b], o, normal, contact)
                 value = CLEARANCE - d
                 if update:
                     ineq[k, b, w] = max(0.0, ineq[k, b, w] + mu * value)
@@ -228,7 +226,8 @@ def _assemble(
                 value = row[0] * (x[at] - region[0]) + row[1] * (x[at + 1] - region[1]) - bound
             else:
                 row[0], row[1] = (sign, 0.0) if side < 6 else (0.0, sign)
-                value = row[0] * x[at] + row[1] * x[at + 1] - table[j, 0 if side < 6 else 1]
+                bound = switches.table[j, 0 if side < 6 else 1]
+                value = row[0] * x[at] + row[1] * x[at + 1] - bound
             index[0], index[1] = at, at + 1
             if update:
                 edge[j, side] = max(0.0, edge[j, side] + mu * value)
@@ -241,60 +240,47 @@ def _assemble(
 
 
 @njit(cache=True)
-def solve(
-    x, m, start, p0, weight, pick_target, place_z, turn, base, lower, upper, link, centre, half,
-    n_bodies, obstacles, stands, moved, support, region, table, frames_x, frames_y, frames_f,
-    grasp_x, grasp_y, grasp_f,
-):  # fmt: skip
-    """Improve x in place; returns the largest violation (m, rad) at the end.
+def solve(x, arm, switches, p0, weight):
+    """Improve x (17m,) in place; returns the largest violation (m, rad) at the end.
 
-    turn (m, 2): angle of the finger axis minus the box's yaw, and the placed box's height.
-    stands (2m, W): whether obstacle w is there at switch k and is not the box in hand.
-    moved (W,): index of the obstacle among the moved boxes, or -1. support (m,): obstacle on
-    which box j is placed, or -1. table (m, 2): bounds of |x| and |y| of each placement.
+    p0, weight (3m,): where the placements are wanted, and how much.
     """
-    n = len(x)
+    n, m = len(x), len(switches.place_z)
     H, g = np.zeros((n, n)), np.zeros(n)
     eq, limit, edge = np.zeros((2 * m, 6)), np.zeros((2 * m, ARM, 2)), np.zeros((m, 8))
-    ineq = np.zeros((2 * m, link.shape[1], len(obstacles)))
+    ineq = np.zeros((2 * m, switches.link.shape[1], len(switches.obstacles)))
+    old, slope_g = x.copy(), np.zeros(n)
     mu, worst, before = 1000.0, 1e9, 1e9
     for outer in range(_OUTER):
+        merit, worst = assemble(
+            x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, False, H, g
+        )
         for _ in range(_INNER):
-            merit, worst = _assemble(
-                x, m, start, p0, weight, pick_target, place_z, turn, base, lower, upper, link,
-                centre, half, n_bodies, obstacles, stands, moved, support, region, table, frames_x,
-                frames_y, frames_f, grasp_x, grasp_y, grasp_f, eq, ineq, limit, edge, mu, False,
-                H, g,
-            )  # fmt: skip
-            step = -g.copy()
+            step = -g
+            slope_g[:] = g
             if not dense_solve(H, step):
                 return 1e9
             longest = np.max(np.abs(step))
             scale = min(1.0, 0.5 / max(longest, 1e-12))
-            slope = np.dot(step, g)
-            old = x.copy()
+            slope = np.dot(step, slope_g)
+            old[:] = x
+            new = merit
             for _ in range(8):
                 x[:] = old + scale * step
-                new, worst = _assemble(
-                    x, m, start, p0, weight, pick_target, place_z, turn, base, lower, upper, link,
-                    centre, half, n_bodies, obstacles, stands, moved, support, region, table,
-                    frames_x, frames_y, frames_f, grasp_x, grasp_y, grasp_f, eq, ineq, limit, edge,
-                    mu, False, H, g,
-                )  # fmt: skip
+                new, worst = assemble(
+                    x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, False, H, g
+                )
                 if new <= merit + 1e-4 * scale * slope + 1e-12:
                     break
                 scale *= 0.4
-            if scale * longest < 1e-4:
+            merit = new
+            if scale * longest < SMALL_STEP:
                 break
         if worst < TOLERANCE / 2 and outer > 0:
             return worst
         if outer >= 3 and worst > 0.7 * before:
             return worst  # stuck
         before = worst
-        _assemble(
-            x, m, start, p0, weight, pick_target, place_z, turn, base, lower, upper, link, centre,
-            half, n_bodies, obstacles, stands, moved, support, region, table, frames_x, frames_y,
-            frames_f, grasp_x, grasp_y, grasp_f, eq, ineq, limit, edge, mu, True, H, g,
-        )  # fmt: skip
+        assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, True, H, g)
         mu = min(mu * 5.0, 1e5)
     return worst

@@ -12,13 +12,14 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numba import njit
 from scipy.spatial import ConvexHull
 
-from relevance.planner.kernels.native import Native, load
+from relevance.planner.kernels.native import Native, call, load
 from relevance.simulation import panda_urdf
 
 ARM = 7
@@ -57,6 +58,60 @@ class Panda:
     """x = (q (7), base (4)); y = 3 frames of FRAME numbers."""
     grasp: Native
     """x = (q (7), base (4), target (4)); y = residual (6), d/dq (6 x 7), d/dtarget (6 x 4)."""
+
+
+class Arm(NamedTuple):
+    """What the solvers use of a Panda at its place; every array is float64 or a handle."""
+
+    base: np.ndarray
+    """(4,) x, y, z, yaw."""
+    lower: np.ndarray
+    upper: np.ndarray
+    velocity: np.ndarray
+    frames_x: np.ndarray
+    frames_y: np.ndarray
+    frames_f: np.ndarray
+    grasp_x: np.ndarray
+    grasp_y: np.ndarray
+    grasp_f: np.ndarray
+
+
+def arm_at(base: np.ndarray) -> Arm:
+    """The Panda at a base (x, y, z, yaw)."""
+    arm = panda()
+    frames, grasp = arm.frames, arm.grasp
+    return Arm(
+        base, arm.lower, arm.upper, arm.velocity, frames.x, frames.y, frames.handle, grasp.x,
+        grasp.y, grasp.handle,
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def look_at_frames(arm, q):
+    """Fill arm.frames_y for the configuration q (7,)."""
+    for i in range(ARM):
+        arm.frames_x[i] = q[i]
+    for i in range(4):
+        arm.frames_x[ARM + i] = arm.base[i]
+    call(arm.frames_f)
+
+
+@njit(cache=True)
+def look_at_grasp(arm, q, target):
+    """Fill arm.grasp_y for the configuration q (7,) and a hand target (4,)."""
+    for i in range(ARM):
+        arm.grasp_x[i] = q[i]
+    for i in range(4):
+        arm.grasp_x[ARM + i], arm.grasp_x[ARM + 4 + i] = arm.base[i], target[i]
+    call(arm.grasp_f)
+
+
+@njit(cache=True)
+def finger_angle(arm, q):
+    """Direction of the downward hand's finger axis (its y) in the world, rad."""
+    look_at_frames(arm, q)
+    axis = HAND * FRAME + 3 + 1
+    return math.atan2(arm.frames_y[axis + 3], arm.frames_y[axis])
 
 
 @cache
@@ -228,17 +283,23 @@ def hand_down(target, base, lower, upper, q):
     return (q >= lower).all() and (q <= upper).all()
 
 
-@njit(cache=True)
-def reach_interval(z, base, lower, upper):
-    """Distances (near, far) from the base's axis that the downward hand reaches at height z, m.
+@cache
+def reach_interval(height: float) -> tuple[float, float]:
+    """Distances (near, far) from the base's axis that the downward hand reaches, m.
 
-    Returns (1, 0) when there are none. Resolution 2 mm.
+    height: of the hand over the base, m. (1, 0) when there are none. Resolution 2 mm.
     """
-    q, target = np.zeros(7), np.zeros(4)
+    arm = panda()
+    return _reach_interval(height, arm.lower, arm.upper)
+
+
+@njit(cache=True)
+def _reach_interval(height, lower, upper):
+    q, target, base = np.zeros(7), np.zeros(4), np.zeros(4)
     near, far = 1.0, 0.0
+    target[2] = height
     for i in range(350):
-        r = 0.15 + 0.002 * i
-        target[0], target[1], target[2] = base[0] + r, base[1], z
+        target[0] = 0.15 + 0.002 * i
         if hand_down(target, base, lower, upper, q):
-            near, far = min(near, r), max(far, r)
+            near, far = min(near, target[0]), max(far, target[0])
     return near, far

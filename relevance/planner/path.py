@@ -9,13 +9,20 @@ Lagrangian on a banded system. Velocity limits are kept by the time between rows
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
-from relevance.planner.kernels.boxes import banded_solve, dense_solve, near, separation
-from relevance.planner.kernels.native import call
-from relevance.planner.keyframes import Bodies, body_pose, point_gradient
-from relevance.planner.kinematics import ARM, FRAME, Panda
+from relevance.planner.kernels.boxes import (
+    banded_solve,
+    body_pose,
+    dense_solve,
+    near,
+    point_gradient,
+    separation,
+)
+from relevance.planner.kinematics import ARM, FRAME, HAND, look_at_frames, look_at_grasp
 
 ROWS = 20
 """Steps of a motion; it has ROWS + 1 rows."""
@@ -33,27 +40,26 @@ SUBSTEPS = 8
 """Points of the dense check in each step."""
 ALLOWED = 1e-3
 """Penetration up to which a plan holds, m."""
+FAR = 0.01
+"""Distances beyond this are not computed, m."""
+SMALL_STEP = 2e-3
+"""Gauss-Newton stops after a step below this, rad; what is left is of the order of its square."""
+TOLERANCE = 4e-4
+"""Largest violation of a solved problem, m or rad."""
 _WIDTH = 3 * ARM
-
-
-def heights(rows: int = VERTICAL) -> np.ndarray:
-    """Height over the switch of the rows beside it, nearest first (rows,), m."""
-    return RISE * (np.arange(1, rows + 1) / rows) ** 2
+_EXCHANGES = 4
 
 
 @njit(cache=True)
-def reach_to(q, target, base, grasp_x, grasp_y, grasp_f):
+def reach_to(arm, q, target):
     """Move q (7,) in place to a hand target (4,) by damped Gauss-Newton; whether it got there."""
     A, b = np.zeros((ARM, ARM)), np.zeros(ARM)
+    worst = 0.0
     for _ in range(25):
-        for i in range(ARM):
-            grasp_x[i] = q[i]
-        for i in range(4):
-            grasp_x[ARM + i], grasp_x[11 + i] = base[i], target[i]
-        call(grasp_f)
+        look_at_grasp(arm, q, target)
         worst = 0.0
         for r in range(6):
-            worst = max(worst, abs(grasp_y[r]))
+            worst = max(worst, abs(arm.grasp_y[r]))
         if worst < 1e-8:
             return True
         for i in range(ARM):
@@ -61,10 +67,10 @@ def reach_to(q, target, base, grasp_x, grasp_y, grasp_f):
             for j in range(ARM):
                 A[i, j] = 1e-7 if i == j else 0.0
             for r in range(6):
-                ji = grasp_y[6 + r * ARM + i]
-                b[i] -= ji * grasp_y[r]
+                ji = arm.grasp_y[6 + r * ARM + i]
+                b[i] -= ji * arm.grasp_y[r]
                 for j in range(ARM):
-                    A[i, j] += ji * grasp_y[6 + r * ARM + j]
+                    A[i, j] += ji * arm.grasp_y[6 + r * ARM + j]
         if not dense_solve(A, b):
             return False
         longest = np.max(np.abs(b))
@@ -74,58 +80,65 @@ def reach_to(q, target, base, grasp_x, grasp_y, grasp_f):
 
 
 @njit(cache=True)
-def distances(q, base, link, centre, half, obstacles, frames_x, frames_y, frames_f, out):
-    """Separating-axis distance of every body and obstacle at q: out (B, W), m."""
+def distances(arm, q, bodies, obstacles, out):
+    """Separating-axis distance of every body and obstacle at q: out (B, W), m; 1 beyond FAR."""
     p, R, normal, contact = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
-    for i in range(ARM):
-        frames_x[i] = q[i]
-    for i in range(4):
-        frames_x[ARM + i] = base[i]
-    call(frames_f)
-    for b in range(len(link)):
-        body_pose(frames_y[link[b] * FRAME : (link[b] + 1) * FRAME], centre[b], p, R)
+    look_at_frames(arm, q)
+    for b in range(len(bodies.link)):
+        at = bodies.link[b] * FRAME
+        body_pose(arm.frames_y[at : at + FRAME], bodies.centre[b], p, R)
         for w in range(len(obstacles)):
             out[b, w] = 1.0
-            if near(p, half[b], obstacles[w], 0.05):
-                out[b, w] = separation(p, R, half[b], obstacles[w], normal, contact)
+            if near(p, bodies.radius[b] + FAR, obstacles[w]):
+                out[b, w] = separation(p, R, bodies.half[b], obstacles[w], normal, contact)
 
 
 @njit(cache=True)
-def _assemble(
-    X, base, lower, upper, link, centre, half, obstacles, margin, samples, n_samples, targets,
-    frames_x, frames_y, frames_f, grasp_x, grasp_y, grasp_f, eq, ineq, limit, mu, update, band, g,
+def smoothness(T):
+    """Second derivative of half the squared accelerations, (n, 3 * ARM) as for `banded_solve`."""
+    band = np.zeros(((T - 1) * ARM, _WIDTH))
+    for t in range(T + 1):
+        for i in range(ARM):
+            for u in range(-1, 2):
+                for v in range(-1, u + 1):
+                    row, column = t + u, t + v
+                    if column < 1 or row > T - 1:
+                        continue
+                    product = (-2.0 if u == 0 else 1.0) * (-2.0 if v == 0 else 1.0)
+                    band[(column - 1) * ARM + i, (row - column) * ARM] += product
+    for i in range(len(band)):
+        band[i, 0] += 1e-6
+    return band
+
+
+@njit(cache=True)
+def assemble(
+    X, arm, bodies, obstacles, margin, samples, n_samples, targets, smooth, eq, ineq, limit, mu,
+    update, band, g,
 ):  # fmt: skip
-    """Merit and Gauss-Newton model of the rows 1..T-1; with `update`, new multipliers."""
+    """Merit and Gauss-Newton model of the rows 1..T-1; with `update`, new multipliers.
+
+    Returns (merit, violation) and fills band (n, 3 * ARM) as `banded_solve` wants it, g (n,).
+    """
     T = len(X) - 1
     merit, worst = 0.0, 0.0
-    band[:, :] = 0.0
+    band[:, :] = smooth
     g[:] = 0.0
     for t in range(T + 1):
         for i in range(ARM):
-            before = X[max(t - 1, 0), i]
-            after = X[min(t + 1, T), i]
-            a = before - 2 * X[t, i] + after
+            a = X[max(t - 1, 0), i] - 2 * X[t, i] + X[min(t + 1, T), i]
             merit += 0.5 * a * a
-            for u in range(-1, 2):
-                s = t + u
-                if s < 1 or s > T - 1:
-                    continue
-                cu = -2.0 if u == 0 else 1.0
-                row = (s - 1) * ARM + i
-                g[row] += cu * a
-                for v in range(-1, u + 1):
-                    s2 = t + v
-                    if s2 < 1 or s2 > T - 1:
-                        continue
-                    cv = -2.0 if v == 0 else 1.0
-                    band[row, (s - s2) * ARM] += cu * cv
-    index, row = np.zeros(2 * ARM, np.int64), np.zeros(2 * ARM)
-    part = np.zeros(ARM)
+            if t > 1:
+                g[(t - 2) * ARM + i] += a
+            if 0 < t < T:
+                g[(t - 1) * ARM + i] -= 2 * a
+            if t < T - 1:
+                g[t * ARM + i] += a
     for t in range(1, T):
         at = (t - 1) * ARM
         for i in range(ARM):
             for side in range(2):
-                value = lower[i] - X[t, i] if side == 0 else X[t, i] - upper[i]
+                value = arm.lower[i] - X[t, i] if side == 0 else X[t, i] - arm.upper[i]
                 if update:
                     limit[t, i, side] = max(0.0, limit[t, i, side] + mu * value)
                 shifted = value + limit[t, i, side] / mu
@@ -135,38 +148,38 @@ def _assemble(
                     g[at + i] += mu * shifted * (-1.0 if side == 0 else 1.0)
                     band[at + i, 0] += mu
         if targets[t, 4] > 0:  # straight over a switch
-            for i in range(ARM):
-                grasp_x[i] = X[t, i]
-            for i in range(4):
-                grasp_x[ARM + i], grasp_x[11 + i] = base[i], targets[t, i]
-            call(grasp_f)
+            look_at_grasp(arm, X[t], targets[t])
             for r in range(6):
-                value = grasp_y[r]
+                value = arm.grasp_y[r]
                 if update:
                     eq[t, r] += mu * value
                 shifted = value + eq[t, r] / mu
                 worst = max(worst, abs(value))
                 merit += 0.5 * mu * shifted * shifted
                 for i in range(ARM):
-                    ji = grasp_y[6 + r * ARM + i]
+                    ji = arm.grasp_y[6 + r * ARM + i]
                     g[at + i] += mu * shifted * ji
                     for j in range(i + 1):
-                        band[at + i, i - j] += mu * ji * grasp_y[6 + r * ARM + j]
+                        band[at + j, i - j] += mu * ji * arm.grasp_y[6 + r * ARM + j]
+    index, row = np.zeros(2 * ARM, np.int64), np.zeros(2 * ARM)
+    part, q = np.zeros(ARM), np.zeros(ARM)
     p, R, normal, contact = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for n in range(n_samples):
         t, alpha = int(samples[n, 0]), samples[n, 1]
         for i in range(ARM):
-            frames_x[i] = X[t, i] if alpha == 0.0 else (1 - alpha) * X[t, i] + alpha * X[t + 1, i]
-        for i in range(4):
-            frames_x[ARM + i] = base[i]
-        call(frames_f)
-        for b in range(len(link)):
-            frame = frames_y[link[b] * FRAME : (link[b] + 1) * FRAME]
-            body_pose(frame, centre[b], p, R)
+            q[i] = X[t, i] if alpha == 0.0 else (1 - alpha) * X[t, i] + alpha * X[t + 1, i]
+        look_at_frames(arm, q)
+        for b in range(len(bodies.link)):
+            start = bodies.link[b] * FRAME
+            frame = arm.frames_y[start : start + FRAME]
+            body_pose(frame, bodies.centre[b], p, R)
             for w in range(len(obstacles)):
-                if ineq[n, b, w] == 0.0 and not near(p, half[b], obstacles[w], margin[b, w]):
+                reach = bodies.radius[b] + margin[b, w]
+                if ineq[n, b, w] == 0.0 and not near(p, reach, obstacles[w]):
                     continue
-                value = margin[b, w] - separation(p, R, half[b], obstacles[w], normal, contact)
+                value = margin[b, w] - separation(
+                    p, R, bodies.half[b], obstacles[w], normal, contact
+                )
                 if update:
                     ineq[n, b, w] = max(0.0, ineq[n, b, w] + mu * value)
                 worst = max(worst, value)
@@ -187,17 +200,12 @@ def _assemble(
                 for a in range(count):
                     g[index[a]] += mu * shifted * row[a]
                     for c in range(a + 1):
-                        band[index[a], index[a] - index[c]] += mu * row[a] * row[c]
-    for i in range(len(band)):
-        band[i, 0] += 1e-6
+                        band[index[c], index[a] - index[c]] += mu * row[a] * row[c]
     return merit, worst
 
 
 @njit(cache=True)
-def solve(
-    X, base, lower, upper, link, centre, half, obstacles, margin, samples, n_samples, targets,
-    frames_x, frames_y, frames_f, grasp_x, grasp_y, grasp_f,
-):  # fmt: skip
+def solve(X, arm, bodies, obstacles, margin, samples, n_samples, targets):
     """Improve the rows X (T + 1, 7) in place, first and last fixed; returns the violation.
 
     targets (T + 1, 5): hand target (x, y, z, finger angle) of the vertical rows, last column 1
@@ -205,66 +213,69 @@ def solve(
     """
     T = len(X) - 1
     n = (T - 1) * ARM
-    band, g = np.zeros((n, _WIDTH)), np.zeros(n)
+    smooth, band, g = smoothness(T), np.zeros((n, _WIDTH)), np.zeros(n)
     eq, limit = np.zeros((T + 1, 6)), np.zeros((T + 1, ARM, 2))
-    ineq = np.zeros((len(samples), len(link), len(obstacles)))
-    mu, worst = 50.0, 1e9
+    ineq = np.zeros((len(samples), len(bodies.link), len(obstacles)))
+    old, slope_g = X.copy(), np.zeros(n)
+    mu, worst = 500.0, 1e9
     for outer in range(8):
+        merit, worst = assemble(
+            X, arm, bodies, obstacles, margin, samples, n_samples, targets, smooth, eq, ineq, limit,
+            mu, False, band, g,
+        )  # fmt: skip
         for _ in range(12):
-            merit, worst = _assemble(
-                X, base, lower, upper, link, centre, half, obstacles, margin, samples, n_samples,
-                targets, frames_x, frames_y, frames_f, grasp_x, grasp_y, grasp_f, eq, ineq, limit,
-                mu, False, band, g,
-            )  # fmt: skip
             step = -g
-            slope_g = g.copy()
+            slope_g[:] = g
             if not banded_solve(band, step):
                 return 1e9
             longest = np.max(np.abs(step))
             scale = min(1.0, 0.5 / max(longest, 1e-12))
             slope = np.dot(step, slope_g)
-            old = X.copy()
+            old[:] = X
+            new = merit
             for _ in range(6):
                 X[1:T] = old[1:T] + scale * step.reshape(T - 1, ARM)
-                new, worst = _assemble(
-                    X, base, lower, upper, link, centre, half, obstacles, margin, samples,
-                    n_samples, targets, frames_x, frames_y, frames_f, grasp_x, grasp_y, grasp_f,
-                    eq, ineq, limit, mu, False, band, g,
+                new, worst = assemble(
+                    X, arm, bodies, obstacles, margin, samples, n_samples, targets, smooth, eq,
+                    ineq, limit, mu, False, band, g,
                 )  # fmt: skip
                 if new <= merit + 1e-4 * scale * slope + 1e-12:
                     break
                 scale *= 0.4
-            if scale * longest < 3e-4:
+            merit = new
+            if scale * longest < SMALL_STEP:
                 break
-        if worst < 2e-4 and outer > 0:
+        if worst < TOLERANCE and outer > 0:
             return worst
-        _assemble(
-            X, base, lower, upper, link, centre, half, obstacles, margin, samples, n_samples,
-            targets, frames_x, frames_y, frames_f, grasp_x, grasp_y, grasp_f, eq, ineq, limit, mu,
-            True, band, g,
+        assemble(
+            X, arm, bodies, obstacles, margin, samples, n_samples, targets, smooth, eq, ineq, limit,
+            mu, True, band, g,
         )  # fmt: skip
         mu = min(mu * 4.0, 1e5)
     return worst
 
 
 @njit(cache=True)
-def dense_check(
-    X, base, link, centre, half, obstacles, margin, frames_x, frames_y, frames_f, broken
-):
+def dense_check(X, arm, bodies, obstacles, margin, broken):
     """Worst penetration (m, 0 if none) over all sub-steps of the rows X.
 
+    Steps that are clear of everything are not looked at more closely.
     Fills broken (T, 2) for each step: the sub-step share where its margin is broken most, and
     by how much (m, 0 if kept).
     """
-    out = np.zeros((len(link), len(obstacles)))
+    out = np.zeros((len(bodies.link), len(obstacles)))
     worst = 0.0
     broken[:, :] = 0.0
+    q = np.zeros(ARM)
     for t in range(len(X) - 1):
+        if _clear(arm, X[t], X[t + 1], bodies, obstacles):
+            continue
         for k in range(SUBSTEPS + 1):
             share = k / SUBSTEPS
-            q = (1 - share) * X[t] + share * X[t + 1]
-            distances(q, base, link, centre, half, obstacles, frames_x, frames_y, frames_f, out)
-            for b in range(len(link)):
+            for i in range(ARM):
+                q[i] = (1 - share) * X[t, i] + share * X[t + 1, i]
+            distances(arm, q, bodies, obstacles, out)
+            for b in range(len(bodies.link)):
                 for w in range(len(obstacles)):
                     worst = max(worst, -out[b, w])
                     short = margin[b, w] - out[b, w]
@@ -273,130 +284,165 @@ def dense_check(
     return worst
 
 
-def motion(
-    arm: Panda,
-    base: np.ndarray,
-    start: np.ndarray,
-    end: np.ndarray,
-    leave: np.ndarray | None,
-    arrive: np.ndarray,
-    body: Bodies,
-    obstacles: np.ndarray,
-) -> tuple[np.ndarray, float] | None:
-    """Rows (ROWS + 1, 7) from configuration `start` to `end`, and their worst penetration (m).
+@njit(cache=True)
+def _clear(arm, q0, q1, bodies, obstacles):
+    """Whether everything stays CLEARANCE apart all the way, by how far bodies move from half-way.
 
-    leave / arrive: hand targets (4,) of the two switches; None when the motion starts free.
-    Returns None where no motion was found that keeps the dense check within ALLOWED.
+    The motion is bounded to first order, with a quarter to spare for the rest.
     """
-    frames, grasp = arm.frames, arm.grasp
-    fx = (frames.x, frames.y, frames.handle)
-    gx = (grasp.x, grasp.y, grasp.handle)
-    shape = (len(body.link), len(obstacles))
-    ends = np.ones((2, *shape))
-    for q, out in zip((start, end), ends, strict=True):
-        distances(q, base, body.link, body.centre, body.half, obstacles, *fx, out)
-    margin = np.minimum(CLEARANCE, ends.min(0)) - 1e-4
+    q = 0.5 * (q0 + q1)
+    p, R, normal, contact = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    look_at_frames(arm, q)
+    for b in range(len(bodies.link)):
+        at = bodies.link[b] * FRAME
+        frame = arm.frames_y[at : at + FRAME]
+        body_pose(frame, bodies.centre[b], p, R)
+        arm_length = math.sqrt(np.sum(bodies.centre[b] ** 2)) + bodies.radius[b]
+        shift, turn = 0.0, 0.0
+        for axis in range(3):
+            v, w = 0.0, 0.0
+            for i in range(ARM):
+                v += frame[12 + ARM * axis + i] * (q1[i] - q0[i])
+                w += frame[33 + ARM * axis + i] * (q1[i] - q0[i])
+            shift, turn = shift + v * v, turn + w * w
+        reach = CLEARANCE + 0.625 * (math.sqrt(shift) + math.sqrt(turn) * arm_length)
+        for w in range(len(obstacles)):
+            if not near(p, bodies.radius[b] + reach, obstacles[w]):
+                continue
+            if separation(p, R, bodies.half[b], obstacles[w], normal, contact) < reach:
+                return False
+    return True
+
+
+@njit(cache=True)
+def motion(X, arm, leave, leaving, arrive, bodies, obstacles):
+    """Fill the rows X (ROWS + 1, 7) between its first and last; returns the worst penetration.
+
+    leave / arrive: hand targets (4,) of the two switches; without `leaving` the motion starts
+    free. Returns -1 where no motion was found that keeps the dense check within ALLOWED.
+    """
+    shape = (len(bodies.link), len(obstacles))
+    first, last = np.zeros(shape), np.zeros(shape)
+    distances(arm, X[0], bodies, obstacles, first)
+    distances(arm, X[ROWS], bodies, obstacles, last)
+    margin = np.minimum(CLEARANCE, np.minimum(first, last)) - 1e-4
     if margin.min() < -ALLOWED:
-        return None
-    guess = _guess(arm, base, start, end, leave, arrive, body, obstacles)
-    if guess is None:
-        return None
-    X, targets = guess
-    samples = np.zeros((2 * ROWS + 3 * ROWS, 2))
+        return -1.0
+    targets = np.zeros((ROWS + 1, 5))
+    if not _guess(X, arm, leave, leaving, arrive, bodies, obstacles, targets):
+        return -1.0
+    samples = np.zeros((2 * ROWS + (_EXCHANGES - 1) * ROWS, 2))
     n = 0
     for t in range(ROWS):
-        for share in (0.0, 0.5):
-            if t or share:
-                samples[n] = t, share
+        for half in range(2):
+            if t or half:
+                samples[n, 0], samples[n, 1] = t, 0.5 * half
                 n += 1
     broken = np.zeros((ROWS, 2))
-    problem = (base, arm.lower, arm.upper, body.link, body.centre, body.half, obstacles, margin)
-    for _ in range(4):
-        violation = solve(X, *problem, samples, n, targets, *fx, *gx)
-        if violation > 1.5e-3:
-            return None
-        depth = dense_check(
-            X, base, body.link, body.centre, body.half, obstacles, margin, *fx, broken
-        )
-        bad = np.flatnonzero(broken[:, 1] > 1.2e-3)
-        if depth <= 0.5 * ALLOWED and len(bad) == 0:
-            return X, depth
-        for t in bad:
-            if n < len(samples) and 0 < broken[t, 0] < 1:
-                samples[n] = t, broken[t, 0]
-                n += 1
-    return (X, depth) if depth <= 0.8 * ALLOWED else None
+    depth = 0.0
+    for _ in range(_EXCHANGES):
+        if solve(X, arm, bodies, obstacles, margin, samples, n, targets) > 1.5e-3:
+            return -1.0
+        depth = dense_check(X, arm, bodies, obstacles, margin, broken)
+        good = depth <= 0.5 * ALLOWED
+        for t in range(ROWS):
+            if broken[t, 1] > 1.2e-3:
+                good = False
+                if n < len(samples) and 0 < broken[t, 0] < 1:
+                    samples[n, 0], samples[n, 1] = t, broken[t, 0]
+                    n += 1
+        if good:
+            return depth
+    return depth if depth <= 0.8 * ALLOWED else -1.0
 
 
-def retreat(
-    arm: Panda, base: np.ndarray, start: np.ndarray, leave: np.ndarray
-) -> np.ndarray | None:
-    """Rows (2 * VERTICAL + 1, 7) straight up from a release, to rest; None out of reach."""
-    rows = [start]
-    steps = np.arange(1, 2 * VERTICAL + 1) / (2 * VERTICAL)
-    for share in steps * steps * (3 - 2 * steps):
-        q = rows[-1].copy()
-        target = leave + np.array([0, 0, RISE * share, 0])
-        if not reach_to(q, target, base, arm.grasp.x, arm.grasp.y, arm.grasp.handle):
-            return None
-        rows.append(q)
-    X = np.array(rows)
-    return X if ((arm.lower <= X) & (arm.upper >= X)).all() else None
-
-
-def time_step(arm: Panda, X: np.ndarray) -> float:
-    """Seconds between rows such that no joint exceeds its share of the velocity limit."""
-    return float(max(STEP, (np.abs(np.diff(X, axis=0)) / arm.velocity).max() / SPEED))
-
-
-def acceleration_cost(X: np.ndarray) -> float:
-    """Sum of squared second differences of the rows, at rest before and after, rad^2."""
-    rest = np.vstack([X[:1], X, X[-1:]])
-    return float((np.diff(rest, n=2, axis=0) ** 2).sum())
-
-
-def _guess(arm, base, start, end, leave, arrive, body, obstacles):
+@njit(cache=True)
+def _guess(X, arm, leave, leaving, arrive, bodies, obstacles, targets):
     """First rows: straight up, across at a safe height in joint space, straight down."""
-    gx = (arm.grasp.x, arm.grasp.y, arm.grasp.handle)
-    X, targets = np.zeros((ROWS + 1, ARM)), np.zeros((ROWS + 1, 5))
-    X[0], X[ROWS] = start, end
-    hand = body.link == 2
-    lowest = float((body.centre[hand, 2] + body.half[hand, 2]).max())
-    safe = float((obstacles[:, 2] + obstacles[:, 6]).max()) + lowest + 0.02
+    lowest = 0.0
+    for b in range(len(bodies.link)):
+        if bodies.link[b] == HAND:
+            lowest = max(lowest, bodies.centre[b, 2] + bodies.half[b, 2])
+    safe = np.max(obstacles[:, 2] + obstacles[:, 6]) + lowest + 0.02
+    start, end = 0, ROWS - VERTICAL
+    raised, lowered = X[0].copy(), X[ROWS].copy()
+    if leaving:
+        start = VERTICAL
+        if not _column(X, arm, raised, leave, 1, 1, safe, targets):
+            return False
+    if not _column(X, arm, lowered, arrive, ROWS - 1, -1, safe, targets):
+        return False
+    up, down = (start + 3 if leaving else start), end - 3
+    for t in range(start + 1, end):
+        for i in range(ARM):
+            if t < up:
+                X[t, i] = X[start, i] + (raised[i] - X[start, i]) * (t - start) / (up - start)
+            elif t <= down:
+                X[t, i] = raised[i] + (lowered[i] - raised[i]) * (t - up) / (down - up)
+            else:
+                X[t, i] = lowered[i] + (X[end, i] - lowered[i]) * (t - down) / (end - down)
+    return True
 
-    def column(q, switch, order):
-        """Rows over one switch, then the highest reachable configuration up to `safe`."""
-        q = q.copy()
-        for t, height in zip(order, heights(), strict=True):
-            targets[t, :4] = switch + np.array([0, 0, height, 0])
-            targets[t, 4] = 1.0
-            if not reach_to(q, targets[t, :4], base, *gx):
-                return None
-            X[t] = q
-        for share in (1.0, 0.75, 0.5, 0.25):
-            top = q.copy()
-            target = switch.copy()
-            target[2] += RISE + share * max(0.0, safe - switch[2] - RISE)
-            inside = reach_to(top, target, base, *gx)
-            if inside and (top >= arm.lower).all() and (top <= arm.upper).all():
-                return top
-        return q
 
-    first, last = 0, ROWS - VERTICAL
-    raised = start
-    if leave is not None:
-        raised = column(start, leave, range(1, VERTICAL + 1))
-        first = VERTICAL
-    lowered = column(end, arrive, range(ROWS - 1, ROWS - VERTICAL - 1, -1))
-    if raised is None or lowered is None:
-        return None
-    up, down = (first + 3 if leave is not None else first), last - 3
-    knots_t = np.array(sorted({first, up, down, last}))
-    knots = {first: X[first].copy(), up: raised, down: lowered, last: X[last].copy()}
-    if leave is None:
-        knots[first] = start
-    for i in range(ARM):
-        X[first : last + 1, i] = np.interp(
-            np.arange(first, last + 1), knots_t, [knots[t][i] for t in knots_t]
-        )
-    return X, targets
+@njit(cache=True)
+def _column(X, arm, q, switch, row, direction, safe, targets):
+    """Rows over one switch; q becomes the highest reachable configuration up to `safe`."""
+    for k in range(VERTICAL):
+        height = RISE * ((k + 1) / VERTICAL) ** 2
+        for i in range(4):
+            targets[row, i] = switch[i]
+        targets[row, 2] += height
+        targets[row, 4] = 1.0
+        if not reach_to(arm, q, targets[row]):
+            return False
+        X[row] = q
+        row += direction
+    target = switch.copy()
+    for k in range(4):
+        top = q.copy()
+        target[2] = switch[2] + RISE + (1.0 - 0.25 * k) * max(0.0, safe - switch[2] - RISE)
+        if reach_to(arm, top, target) and (top >= arm.lower).all() and (top <= arm.upper).all():
+            q[:] = top
+            break
+    return True
+
+
+@njit(cache=True)
+def retreat(X, arm, leave, bodies, obstacles):
+    """Fill the rows X (2 * VERTICAL + 1, 7) after its first: straight up from a release, to rest.
+
+    Returns the worst penetration (m), or -1 out of reach.
+    """
+    steps = len(X) - 1
+    target = leave.copy()
+    for t in range(1, steps + 1):
+        share = t / steps
+        target[2] = leave[2] + RISE * share * share * (3 - 2 * share)
+        X[t] = X[t - 1]
+        if not reach_to(arm, X[t], target):
+            return -1.0
+        if (X[t] < arm.lower).any() or (X[t] > arm.upper).any():
+            return -1.0
+    margin = np.zeros((len(bodies.link), len(obstacles)))
+    return dense_check(X, arm, bodies, obstacles, margin, np.zeros((steps, 2)))
+
+
+@njit(cache=True)
+def time_step(arm, X):
+    """Seconds between rows such that no joint exceeds its share of the velocity limit."""
+    slowest = STEP
+    for t in range(len(X) - 1):
+        for i in range(ARM):
+            slowest = max(slowest, abs(X[t + 1, i] - X[t, i]) / arm.velocity[i] / SPEED)
+    return slowest
+
+
+@njit(cache=True)
+def acceleration_cost(X):
+    """Sum of squared second differences of the rows, at rest before and after, rad^2."""
+    total, T = 0.0, len(X) - 1
+    for t in range(T + 1):
+        for i in range(ARM):
+            a = X[max(t - 1, 0), i] - 2 * X[t, i] + X[min(t + 1, T), i]
+            total += a * a
+    return total

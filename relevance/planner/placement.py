@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numba import njit
 
-from relevance.planner.kernels.boxes import rectangle_gap
+from relevance.planner.kernels.boxes import UPRIGHT, rectangle_gap, upright
 from relevance.planner.kinematics import panda
 from relevance.scene import Box
 
@@ -55,54 +56,82 @@ class Grasp:
 
 def grasps(box: Box) -> tuple[Grasp, ...]:
     """The grasps that the gripper's opening allows, narrower edge first."""
-    arm = panda()
-    tip, finger = arm.finger
-    depth = min(DEPTH, max(box.size[2] - 0.012, 0.3 * box.size[2]))
-    above = box.size[2] / 2 - depth + arm.finger_tip
-    hand_low, hand_high = arm.arm[-1][1] - arm.arm[-1][2], arm.arm[-1][1] + arm.arm[-1][2]
+    hand = _hand()
+    length, width, height = box.size
+    above = height / 2 - min(DEPTH, max(height - 0.012, 0.3 * height)) + hand.tip
     found = []
-    for axis in sorted((0, 1), key=lambda a: box.size[a]):
+    for axis in (0, 1) if length <= width else (1, 0):
         closed = box.size[axis] / 2
         opening = closed + SPREAD
-        if opening > arm.max_opening:
+        if opening > hand.max_opening:
             continue
-        origin = box.size[2] / 2 + above  # of the hand over the box's bottom
-        parts = [(0.0, box.size[axis] / 2, box.size[1 - axis] / 2, 0.0)]
-        for low, high in (tip, finger):
-            for side in (1.0, -1.0):
-                offset = side * (opening + (low[1] + high[1]) / 2)
-                across = max(abs(low[0]), abs(high[0]))
-                parts.append((offset, (high[1] - low[1]) / 2, across, origin - high[2]))
-        reach = max(abs(hand_low[1]), abs(hand_high[1]))
-        parts.append((0.0, reach, max(abs(hand_low[0]), abs(hand_high[0])), origin - hand_high[2]))
-        found.append(
-            Grasp(axis=axis, opening=opening, closed=closed, above=above, parts=np.array(parts))
-        )
+        parts = np.empty((2 + len(hand.fingers), 4))
+        parts[0] = 0.0, closed, box.size[1 - axis] / 2, 0.0
+        parts[1:-1] = hand.fingers
+        parts[1:-1, 0] += hand.sides * opening
+        parts[-1] = hand.palm
+        parts[1:, 3] += height / 2 + above  # of the hand over the box's bottom
+        found.append(Grasp(axis=axis, opening=opening, closed=closed, above=above, parts=parts))
     return tuple(found)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Hand:
+    """The downward hand as rectangles, like `Grasp.parts`, heights relative to its origin."""
+
+    fingers: np.ndarray
+    sides: np.ndarray
+    palm: np.ndarray
+    tip: float
+    max_opening: float
+
+
+@cache
+def _hand() -> _Hand:
+    arm = panda()
+    rows, sides = [], []
+    for low, high in arm.finger:
+        for side in (1.0, -1.0):
+            across = max(abs(low[0]), abs(high[0]))
+            rows.append((side * (low[1] + high[1]) / 2, (high[1] - low[1]) / 2, across, -high[2]))
+            sides.append(side)
+    _, centre, half = arm.arm[-1]
+    reach = np.abs(centre) + half
+    return _Hand(
+        fingers=np.array(rows),
+        sides=np.array(sides),
+        palm=np.array([0.0, reach[1], reach[0], -(centre[2] + half[2])]),
+        tip=arm.finger_tip,
+        max_opening=arm.max_opening,
+    )
+
+
 def obstacle(box: Box) -> np.ndarray:
-    """(7,): x, y, z, yaw and half extents, m and rad."""
-    return np.array([*box.position, box.yaw, *(edge / 2 for edge in box.size)])
+    """The box as an obstacle row (UPRIGHT,), m and rad."""
+    row = np.empty(UPRIGHT)
+    x, y, z = box.position
+    upright(x, y, z, box.yaw, box.size[0] / 2, box.size[1] / 2, box.size[2] / 2, row)
+    return row
 
 
-def pick_blockers(box: Box, grasp: Grasp, others: list[Box]) -> frozenset[str]:
-    """Names of the boxes that are in the way of taking `box` with this grasp."""
-    angle = box.yaw + grasp.axis * math.pi / 2
-    blocking = set()
-    for other in others:
-        o = obstacle(other)
-        gap = clearance(
-            box.position[0], box.position[1], angle, box.bottom, grasp.parts[1:], o[None, :]
-        )
-        # Something that overhangs the box blocks the way up.
-        above = other.bottom >= box.top - 2e-3 and (
-            clearance(box.position[0], box.position[1], angle, box.top, grasp.parts[:1], o[None, :])
-            < 0
-        )
-        if gap < PICK_MARGIN or above or other.on == box.name:
-            blocking.add(other.name)
-    return frozenset(blocking)
+@njit(cache=True)
+def pick_blockers(i, axis, parts, obstacles, blocking):
+    """Fill blocking (N,) bool: which boxes are in the way of taking box i with this grasp.
+
+    obstacles (N, UPRIGHT): all the boxes.
+    """
+    o = obstacles[i]
+    angle = o[3] + axis * math.pi / 2
+    bottom, top = o[2] - o[6], o[2] + o[6]
+    for k in range(len(obstacles)):
+        other = obstacles[k : k + 1]
+        blocking[k] = False
+        if k == i:
+            continue
+        if clearance(o[0], o[1], angle, bottom, parts[1:], other) < PICK_MARGIN:
+            blocking[k] = True
+        elif other[0, 2] - other[0, 6] >= top - 2e-3:  # what overhangs the box blocks the way up
+            blocking[k] = clearance(o[0], o[1], angle, top, parts[:1], other) < 0
 
 
 @njit(cache=True)
@@ -119,14 +148,27 @@ def clearance(x, y, angle, bottom, parts, obstacles):
             # The box itself comes down onto its support; the gripper stays clear of what is below.
             if o[2] + o[6] <= bottom + under + (1e-3 if i == 0 and under == 0.0 else -MARGIN):
                 continue
-            flat = radius + math.sqrt(o[4] * o[4] + o[5] * o[5]) + best
+            flat = radius + o[7] + best
             dx, dy = o[0] - px, o[1] - py
             if dx * dx + dy * dy > flat * flat:
                 continue
-            best = min(
-                best, rectangle_gap(px, py, angle, along, across, o[0], o[1], o[3], o[4], o[5])
-            )
+            gap = rectangle_gap(px, py, c, s, along, across, o[0], o[1], o[8], o[9], o[4], o[5])
+            best = min(best, gap)
     return best
+
+
+@njit(cache=True)
+def volumes(parts, pose, bottom, top, sky):
+    """The box at a pose and the gripper that puts it there, as rows up to the sky, (P, UPRIGHT)."""
+    rows = np.empty((len(parts), UPRIGHT))
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(len(parts)):
+        low, high = bottom + parts[i, 3], top if i == 0 else sky
+        x, y = pose[0] + c * parts[i, 0], pose[1] + s * parts[i, 0]
+        upright(
+            x, y, (low + high) / 2, pose[2], parts[i, 1], parts[i, 2], (high - low) / 2, rows[i]
+        )
+    return rows
 
 
 @njit(cache=True)

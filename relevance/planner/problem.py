@@ -8,19 +8,33 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from relevance.planner import keyframes, logic, path, placement
-from relevance.planner.kernels.native import call
-from relevance.planner.kinematics import ARM, FRAME, HAND, HOME, hand_down, panda, reach_interval
+from relevance.planner.kernels.boxes import UPRIGHT, Bodies, upright
+from relevance.planner.kinematics import (
+    ARM,
+    HOME,
+    Arm,
+    arm_at,
+    finger_angle,
+    hand_down,
+    panda,
+    reach_interval,
+)
 from relevance.planner.placement import FOUND, UNDECIDED, Grasp
-from relevance.scene import Box, Goal, Phase, Pose, Predicate, Scene, region
+from relevance.scene import Action, Box, Goal, Phase, Pose, Predicate, Scene, region
 
 REGION_MARGIN = 0.001
 """How far inside the goal region a subject is placed, m."""
 TABLE_MARGIN = 0.005
+REACH_MARGIN = 0.004
+"""Distance kept from the ends of the arm's reach, m."""
+SKY = 2.0
+"""Height up to which the hand and what is above it count as an obstacle, m."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -79,40 +93,62 @@ class Problem:
     blockers: dict[str, tuple[frozenset[str], ...]] = field(init=False)
     """Per object and grasp: who must have left before it can be picked that way."""
     above: dict[str, frozenset[str]] = field(init=False)
+    obstacles: np.ndarray = field(init=False)
+    """(N + 2, UPRIGHT): the boxes as they stand at first, then the table and the robot's foot."""
+    arm: Arm = field(init=False)
     _memo: dict = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         began = time.process_time()
         self.boxes = {box.name: box for box in self.scene.objects}
-        self.base = np.array([*self.scene.robot.base, self.scene.robot.yaw])
+        self.index = {name: i for i, name in enumerate(self.boxes)}
+        self.arm = arm_at(np.array([*self.scene.robot.base, self.scene.robot.yaw]))
+        self.table = np.array(self.scene.table.size) / 2
+        standing = [placement.obstacle(box) for box in self.scene.objects]
+        self.obstacles = np.array([*standing, *self._fixtures()])
         self.above = logic.stacked_on(self.scene)
-        self.grasps, self.blockers, self._reach = {}, {}, {}
-        for box in self.scene.objects:
-            others = [other for other in self.scene.objects if other.name != box.name]
-            usable = [g for g in placement.grasps(box) if self._reachable(box, g)]
-            self.grasps[box.name] = tuple(usable)
-            self.blockers[box.name] = tuple(placement.pick_blockers(box, g, others) for g in usable)
+        self.grasps, self.blockers = {}, {}
+        blocking = np.zeros(len(standing), np.bool_)
+        for i, (name, box) in enumerate(self.boxes.items()):
+            self.grasps[name] = tuple(g for g in placement.grasps(box) if self._reachable(box, g))
+            sets = []
+            for grasp in self.grasps[name]:
+                placement.pick_blockers(
+                    i, grasp.axis, grasp.parts, self.obstacles[: len(standing)], blocking
+                )
+                names = zip(self.boxes, blocking, strict=True)
+                sets.append(frozenset(other for other, bad in names if bad))
+            self.blockers[name] = tuple(sets)
         self.counts.pose += len(self.boxes)
         self.seconds.pose += time.process_time() - began
 
+    def _fixtures(self) -> list[np.ndarray]:
+        """What always stands there, as obstacles: the table and the robot's foot."""
+        table, foot = np.empty(UPRIGHT), np.empty(UPRIGHT)
+        upright(0.0, 0.0, -0.05, 0.0, *self.table, 0.05, table)
+        (x, y, z), half = panda().foot
+        bx, by, bz, yaw = self.arm.base
+        c, s = math.cos(yaw), math.sin(yaw)
+        upright(bx + c * x - s * y, by + s * x + c * y, bz + z, yaw, *half, foot)
+        return [table, foot]
+
+    def _standing(self, gone: Collection[str]) -> np.ndarray:
+        """The boxes that have not gone, as obstacles."""
+        stays = [i for name, i in self.index.items() if name not in gone]
+        return self.obstacles[stays]
+
     def _interval(self, bottom: float, box: Box, grasp: Grasp) -> tuple[float, float]:
         """Reach (near, far) for holding the box with its underside at this height, liftably."""
-        arm, z = panda(), bottom + box.size[2] / 2 + grasp.above
-        key = round(z, 4)
-        if key not in self._reach:
-            ends = [
-                reach_interval(height, self.base, arm.lower, arm.upper)
-                for height in (z, z + placement.LIFT)
-            ]
-            self._reach[key] = (
-                max(near for near, _ in ends) + 0.004,
-                min(far for _, far in ends) - 0.004,
-            )
-        return self._reach[key]
+        z = bottom + box.size[2] / 2 + grasp.above - self.arm.base[2]
+        # Heights in whole millimetres, to compute each once; REACH_MARGIN covers the rest.
+        near, far = reach_interval(round(z, 3))
+        near_up, far_up = reach_interval(round(z + placement.LIFT, 3))
+        return max(near, near_up) + REACH_MARGIN, min(far, far_up) - REACH_MARGIN
 
     def _reachable(self, box: Box, grasp: Grasp) -> bool:
         near, far = self._interval(box.bottom, box, grasp)
-        r = math.hypot(box.position[0] - self.base[0], box.position[1] - self.base[1])
+        base = self.arm.base
+        r = math.hypot(box.position[0] - base[0], box.position[1] - base[1])
         return near <= r <= far
 
     # -- pose bound ---------------------------------------------------------------------------
@@ -138,12 +174,8 @@ class Problem:
             return self._memo[key]
         subject = self.boxes[self.goal.subject]
         bottom = reference.top if self.goal.predicate is Predicate.ON else 0.0
-        standing = [
-            placement.obstacle(box)
-            for box in self.scene.objects
-            if box.name not in gone and box.name not in (subject.name, reference.name)
-        ]
-        standing.append(placement.obstacle(reference))
+        standing = self._standing(gone | {subject.name, reference.name})
+        standing = np.vstack([standing, placement.obstacle(reference)])
         area = self.goal_region(reference)
         self._memo[key] = self._find(area, area[:2], bottom, subject, grasp, standing)
         return self._memo[key]
@@ -166,11 +198,10 @@ class Problem:
         self.counts.pose += 1
         near, far = self._interval(bottom, box, grasp)
         pose = np.zeros(3)
-        table = np.array(self.scene.table.size) / 2
-        stacked = np.array(obstacles).reshape(-1, 7)
         status, _ = placement.find_pose(
-            area, np.array(prefer), bottom, grasp.parts, stacked, table, self.base, near, far, pose
-        )
+            area, np.array(prefer), bottom, grasp.parts, obstacles, self.table, self.arm.base,
+            near, far, pose,
+        )  # fmt: skip
         self.seconds.pose += time.process_time() - began
         if status == UNDECIDED:
             self.undecided = True
@@ -188,7 +219,7 @@ class Problem:
             if pose is None:
                 continue
             bottom = reference.top if self.goal.predicate is Predicate.ON else 0.0
-            kept = _volumes(subject, grasp, pose, bottom)
+            kept = placement.volumes(grasp.parts, pose, bottom, bottom + subject.size[2], SKY)
             found = self._place_blockers(order, kept, reference)
             if found is not None:
                 return [*found, Placement(grasp=grasp, pose=pose)]
@@ -199,8 +230,7 @@ class Problem:
         reference = self.boxes[self.goal.reference]
         if reference.name not in order:
             return [reference]
-        found, gone = [], frozenset(order)
-        standing = [placement.obstacle(box) for box in self.scene.objects if box.name not in gone]
+        found, standing = [], self._standing(order)
         for grasp in self.pickable(reference.name, frozenset(order[: order.index(reference.name)])):
             for prefer in ((0.0, 0.0), (-0.1, 0.25), (-0.1, -0.25), (0.1, 0.15), (0.1, -0.15)):
                 pose = self._find(self._table(), prefer, 0.0, reference, grasp, standing)
@@ -210,51 +240,43 @@ class Problem:
         return found
 
     def _table(self) -> np.ndarray:
-        half = np.array(self.scene.table.size) / 2 - TABLE_MARGIN
-        return np.array([0.0, 0.0, 0.0, *half])
+        return np.array([0.0, 0.0, 0.0, *(self.table - TABLE_MARGIN)])
 
     def _place_blockers(self, order, kept, reference: Box) -> list[Placement] | None:
         """Free table poses of all but the last, clear of what is still there when they land."""
         placed: list[Placement] = []
-        landed: list[np.ndarray] = []
+        landed = np.empty((0, UPRIGHT))
         for i, name in enumerate(order[:-1]):
             box = self.boxes[name]
-            gone = frozenset(order[: i + 1])
-            standing = [placement.obstacle(b) for b in self.scene.objects if b.name not in gone]
             top = box.size[2] + placement.MARGIN
-            later = [o for o in self._later_picks(order[i + 1 :]) if o[2] - o[6] < top]
-            reserved = [o for o in kept if o[2] - o[6] < top]
+            hands = np.vstack([kept, *self._later_picks(order[i + 1 :])])
+            low = hands[hands[:, 2] - hands[:, 6] < top]
+            obstacles = np.vstack([self._standing(order[: i + 1]), landed, low])
             found = None
             for grasp in self.pickable(name, frozenset(order[:i])):
+                prefer, area = box.position[:2], self._table()
                 if name == reference.name:
-                    prefer, area = (
-                        reference.position[:2],
-                        np.array([*reference.position[:2], 0.0, 0.002, 0.002]),
-                    )
-                else:
-                    prefer, area = box.position[:2], self._table()
-                pose = self._find(
-                    area, prefer, 0.0, box, grasp, [*standing, *landed, *reserved, *later]
-                )
+                    prefer = reference.position[:2]
+                    area = np.array([*prefer, 0.0, 0.002, 0.002])
+                pose = self._find(area, prefer, 0.0, box, grasp, obstacles)
                 if pose is not None:
                     found = Placement(grasp=grasp, pose=pose)
                     break
             if found is None:
                 return None
             placed.append(found)
-            landed.append(placement.obstacle(_moved_box(box, found.grasp, found.pose, 0.0, None)))
+            there = placement.obstacle(_moved_box(box, found.grasp, found.pose, 0.0, None))
+            landed = np.vstack([landed, there])
         return placed
 
     def _later_picks(self, names: tuple[str, ...]) -> list[np.ndarray]:
         """Where the gripper will be when it takes these boxes."""
-        rows = []
+        found = []
         for name in names:
-            box = self.boxes[name]
-            grasp = self.grasps[name][0]
-            angle = box.yaw + grasp.axis * math.pi / 2
-            pose = (box.position[0], box.position[1], angle)
-            rows += _volumes(box, grasp, pose, box.bottom)[1:]
-        return rows
+            box, grasp = self.boxes[name], self.grasps[name][0]
+            x, y, _, angle = self.pick_target(box, grasp)
+            found.append(placement.volumes(grasp.parts, (x, y, angle), box.bottom, 0.0, SKY)[1:])
+        return found
 
     # -- keyframe bound -----------------------------------------------------------------------
 
@@ -268,50 +290,51 @@ class Problem:
 
     def _solve_keyframes(self, order, placements):
         arm, m = panda(), len(order)
-        names = list(self.boxes)
-        obstacles = np.array([placement.obstacle(b) for b in self.boxes.values()] + self.fixtures())
-        moved = np.array([order.index(n) if n in order else -1 for n in names] + [-1, -1])
-        stands = np.ones((2 * m, len(obstacles)), np.bool_)
-        supports = np.full(m, len(names))
+        moved = np.full(len(self.obstacles), -1)
+        stands = np.ones((2 * m, len(self.obstacles)), np.bool_)
+        supports = np.full(m, len(self.boxes))  # the table
         widest = len(arm.arm) + 2 * len(arm.finger) + 1
-        link = np.zeros((2 * m, widest), np.int64)
+        link, n_bodies = np.zeros((2 * m, widest), np.int64), np.zeros(2 * m, np.int64)
         centre, half = np.zeros((2 * m, widest, 3)), np.zeros((2 * m, widest, 3))
-        n_bodies = np.zeros(2 * m, np.int64)
-        pick_target, place_z, turn = np.zeros((m, 4)), np.zeros(m), np.zeros((m, 2))
-        bounds = np.zeros((m, 2))
+        radius = np.zeros((2 * m, widest))
+        pick, place_z, turn = np.zeros((m, 4)), np.zeros(m), np.zeros((m, 2))
+        table = np.zeros((m, 2))
         x = np.zeros(17 * m)
         p0, weight = np.zeros(3 * m), np.zeros(3 * m)
         for j, (name, place) in enumerate(zip(order, placements, strict=True)):
             box, grasp = self.boxes[name], place.grasp
             bottom = 0.0
             if name == self.goal.subject and self.goal.predicate is Predicate.ON:
-                supports[j] = names.index(self.goal.reference)
+                supports[j] = self.index[self.goal.reference]
                 bottom = self.boxes[self.goal.reference].top
-            pick_target[j] = self.pick_target(box, grasp)
+            moved[self.index[name]] = j
+            pick[j] = self.pick_target(box, grasp)
             place_z[j] = bottom + box.size[2] / 2 + grasp.above
             turn[j] = grasp.axis * math.pi / 2, bottom + box.size[2] / 2
             p0[3 * j : 3 * j + 3] = place.pose
-            for k, carried in ((2 * j, None), (2 * j + 1, _carried(box, grasp))):
-                body = keyframes.bodies(arm, grasp.opening, carried)
-                n_bodies[k] = len(body.link)
-                link[k, : n_bodies[k]] = body.link
-                centre[k, : n_bodies[k]], half[k, : n_bodies[k]] = body.centre, body.half
-                stands[k, names.index(name)] = False
+            for k in (2 * j, 2 * j + 1):
+                body = self.bodies(name, grasp, holding=k % 2 == 1, opening=grasp.opening)
+                n_bodies[k] = count = len(body.link)
+                link[k, :count], centre[k, :count], half[k, :count], radius[k, :count] = body
+                stands[k, self.index[name]] = False
             c, s = abs(math.cos(place.pose[2])), abs(math.sin(place.pose[2]))
             along, across = grasp.parts[0, 1], grasp.parts[0, 2]
-            bounds[j] = np.array(self.scene.table.size) / 2
-            bounds[j] -= c * along + s * across, s * along + c * across
+            table[j] = self.table
+            table[j] -= c * along + s * across, s * along + c * across
             target = np.array([*place.pose[:2], place_z[j], place.pose[2]])
-            for k, t in ((2 * j, pick_target[j]), (2 * j + 1, target)):
-                q = np.zeros(ARM)
-                if not hand_down(t, self.base, arm.lower, arm.upper, q):
+            for k, t in ((2 * j, pick[j]), (2 * j + 1, target)):
+                q = x[k * ARM : (k + 1) * ARM]
+                if not hand_down(t, self.arm.base, arm.lower, arm.upper, q):
                     return None
-                x[k * ARM : (k + 1) * ARM] = q
         x[14 * m :] = p0
         reference = self.boxes[self.goal.reference]
         if reference.name in order:
             j = order.index(reference.name)
             reference = _moved_box(reference, placements[j].grasp, placements[j].pose, 0.0, None)
+        switches = keyframes.Switches(
+            HOME, pick, place_z, turn, link, centre, half, radius, n_bodies, self.obstacles, stands,
+            moved, supports, self.goal_region(reference), table,
+        )  # fmt: skip
         start = x.copy()
         for stay in keyframes.STAY:
             weight[:] = stay
@@ -319,24 +342,17 @@ class Problem:
                 j = order.index(reference.name)
                 weight[3 * j : 3 * j + 3] = 1e6
             x[:] = start
-            violation = keyframes.solve(
-                x, m, HOME, p0, weight, pick_target, place_z, turn, self.base, arm.lower,
-                arm.upper, link, centre, half, n_bodies, obstacles, stands, moved, supports,
-                self.goal_region(reference), bounds, arm.frames.x, arm.frames.y,
-                arm.frames.handle, arm.grasp.x, arm.grasp.y, arm.grasp.handle,
-            )  # fmt: skip
-            if violation <= keyframes.TOLERANCE:
+            if keyframes.solve(x, self.arm, switches, p0, weight) <= keyframes.TOLERANCE:
                 return x[: 14 * m].reshape(2 * m, ARM), x[14 * m :].reshape(m, 3)
         return None
 
-    def fixtures(self) -> list[np.ndarray]:
-        """What always stands there, as obstacles: the table (first) and the robot's foot."""
-        table = np.array([0, 0, -0.05, 0, *(edge / 2 for edge in self.scene.table.size), 0.05])
-        centre, half = panda().foot
-        c, s = math.cos(self.base[3]), math.sin(self.base[3])
-        x = self.base[0] + c * centre[0] - s * centre[1]
-        y = self.base[1] + s * centre[0] + c * centre[1]
-        return [table, np.array([x, y, self.base[2] + centre[2], self.base[3], *half])]
+    def bodies(self, name: str, grasp: Grasp, *, holding: bool, opening: float) -> Bodies:
+        """What moves with the arm before (and after) taking a box, or while holding it."""
+        key = (name, grasp.axis, holding, opening)
+        if key not in self._memo:
+            carried = _carried(self.boxes[name], grasp) if holding else None
+            self._memo[key] = keyframes.bodies(panda(), opening, carried)
+        return self._memo[key]
 
     def pick_target(self, box: Box, grasp: Grasp) -> np.ndarray:
         """Hand target (x, y, z, finger angle) over a standing box."""
@@ -353,100 +369,60 @@ class Problem:
         return found
 
     def _solve_paths(self, order, placements, q, poses) -> Motion | None:
-        arm = panda()
-        standing = dict(self.boxes)
+        obstacles = self.obstacles.copy()
+        there = np.ones(len(obstacles), np.bool_)
         phases: list[Phase] = []
         final: dict[str, Pose] = {}
-        cost, worst = 0.0, 0.0
-        at, leave = HOME, None
         sequence = logic.actions(self.goal, order)
+        cost, worst = 0.0, 0.0
+        at, leave, leaving = HOME, np.zeros(4), False
         for j, (name, place) in enumerate(zip(order, placements, strict=True)):
-            box, grasp = self.boxes[name], place.grasp
+            box, grasp, i = self.boxes[name], place.grasp, self.index[name]
             last = name == self.goal.subject
             on = self.goal.reference if last and self.goal.predicate is Predicate.ON else None
-            bottom = standing[on].top if on else 0.0
+            bottom = 0.0
+            if on is not None:
+                bottom = obstacles[self.index[on], 2] + obstacles[self.index[on], 6]
             take = self.pick_target(box, grasp)
-            put = np.array(
-                [poses[j, 0], poses[j, 1], bottom + box.size[2] / 2 + grasp.above, poses[j, 2]]
-            )
-            for k, (leaving, arriving, carried) in enumerate(
-                ((leave, take, None), (take, put, _carried(box, grasp)))
+            z = bottom + box.size[2] / 2 + grasp.above
+            put = np.array([poses[j, 0], poses[j, 1], z, poses[j, 2]])
+            free = self.bodies(name, grasp, holding=False, opening=grasp.opening)
+            held = self.bodies(name, grasp, holding=True, opening=grasp.closed)
+            for k, (arrive, body, opening) in enumerate(
+                ((take, free, grasp.opening), (put, held, grasp.closed))
             ):
                 self.counts.path += 1
-                if carried is not None:
-                    del standing[name]
-                obstacles = np.array(
-                    [placement.obstacle(b) for b in standing.values()] + self.fixtures()
-                )
-                opening = grasp.closed if carried is not None else grasp.opening
-                body = keyframes.bodies(arm, opening, carried)
-                found = path.motion(
-                    arm, self.base, at, q[2 * j + k], leaving, arriving, body, obstacles
-                )
-                if found is None:
+                there[i] = k == 0
+                X = np.empty((path.ROWS + 1, ARM))
+                X[0], X[-1] = at, q[2 * j + k]
+                depth = path.motion(X, self.arm, leave, leaving, arrive, body, obstacles[there])
+                if depth < 0:
                     return None
-                X, depth = found
+                action, carried = sequence[2 * j + k], name if k else None
+                phases.append(self._phase(X, action, opening, carried))
                 cost, worst = cost + path.acceleration_cost(X), max(worst, depth)
-                phases.append(
-                    Phase(
-                        action=sequence[2 * j + k],
-                        q=X,
-                        dt=path.time_step(arm, X),
-                        opening=opening,
-                        carried=name if carried is not None else None,
-                    )
-                )
-                at = X[-1]
-            landed = self._land(box, grasp, q[2 * j], q[2 * j + 1], poses[j], bottom, on)
-            standing[name] = landed
-            final[name] = Pose(position=landed.position, yaw=landed.yaw, on=on)
-            X = path.retreat(arm, self.base, at, put)
-            if X is None:
+                at, leave, leaving = X[-1], arrive, True
+            there[i] = True
+            turned = finger_angle(self.arm, q[2 * j + 1]) - finger_angle(self.arm, q[2 * j])
+            yaw = (box.yaw + turned + math.pi) % (2 * math.pi) - math.pi
+            position = (float(poses[j, 0]), float(poses[j, 1]), bottom + box.size[2] / 2)
+            upright(*position, yaw, *obstacles[i, 4:7], obstacles[i])
+            final[name] = Pose(position=position, yaw=yaw, on=on)
+            X = np.empty((2 * path.VERTICAL + 1, ARM))
+            X[0] = at
+            depth = path.retreat(X, self.arm, put, free, obstacles[there])
+            if not 0 <= depth <= path.ALLOWED:
                 return None
-            depth = self._check(X, keyframes.bodies(arm, grasp.opening), standing)
-            if depth > path.ALLOWED:
-                return None
-            worst, cost = max(worst, depth), cost + path.acceleration_cost(X)
-            phases.append(
-                Phase(
-                    action=None,
-                    q=X,
-                    dt=path.time_step(arm, X),
-                    opening=grasp.opening,
-                    carried=None,
-                )
-            )
-            at, leave = X[-1], None
+            phases.append(self._phase(X, None, grasp.opening, None))
+            cost, worst = cost + path.acceleration_cost(X), max(worst, depth)
+            at, leaving = X[-1], False
         return Motion(
             order=order, phases=tuple(phases), final=final, cost=cost, max_penetration=worst
         )
 
-    def _check(self, X: np.ndarray, body: keyframes.Bodies, standing: dict[str, Box]) -> float:
-        arm = panda()
-        obstacles = np.array([placement.obstacle(b) for b in standing.values()] + self.fixtures())
-        margin = np.zeros((len(body.link), len(obstacles)))
-        return path.dense_check(
-            X, self.base, body.link, body.centre, body.half, obstacles, margin, arm.frames.x,
-            arm.frames.y, arm.frames.handle, np.zeros((len(X) - 1, 2)),
-        )  # fmt: skip
-
-    def _land(self, box, grasp, q_pick, q_place, pose, bottom, on) -> Box:
-        """The box after the release; its yaw follows the hand, which may have turned over."""
-        angles = []
-        for q in (q_pick, q_place):
-            frames = panda().frames
-            frames.x[:ARM], frames.x[ARM:] = q, self.base
-            call(frames.handle)
-            R = frames.y[HAND * FRAME + 3 : HAND * FRAME + 12].reshape(3, 3)
-            angles.append(math.atan2(R[1, 1], R[0, 1]))
-        yaw = box.yaw + angles[1] - angles[0]
-        yaw = (yaw + math.pi) % (2 * math.pi) - math.pi
-        return replace(
-            box,
-            position=(float(pose[0]), float(pose[1]), bottom + box.size[2] / 2),
-            yaw=yaw,
-            on=on,
-        )
+    def _phase(self, X, action: Action | None, opening: float, carried: str | None) -> Phase:
+        dt = path.time_step(self.arm, X)
+        return Phase(action=action, q=X, dt=dt, opening=opening, carried=carried)
 
 
 def _carried(box: Box, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
@@ -462,14 +438,3 @@ def _moved_box(box: Box, grasp: Grasp, pose, bottom: float, on: str | None) -> B
         yaw=pose[2] - grasp.axis * math.pi / 2,
         on=on,
     )
-
-
-def _volumes(box: Box, grasp: Grasp, pose, bottom: float) -> list[np.ndarray]:
-    """The box at a pose and the gripper that puts it there, as obstacles up to the sky."""
-    rows = []
-    for i, (offset, along, across, under) in enumerate(grasp.parts):
-        low = bottom + under
-        high = bottom + box.size[2] if i == 0 else 2.0
-        x, y = pose[0] + math.cos(pose[2]) * offset, pose[1] + math.sin(pose[2]) * offset
-        rows.append(np.array([x, y, (low + high) / 2, pose[2], along, across, (high - low) / 2]))
-    return rows

@@ -14,16 +14,26 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal, Protocol
 
 from relevance.planner import logic
 from relevance.planner.problem import Counts, Motion, Problem, Seconds
-from relevance.scene import Action, Box, Goal, Phase, Pose, Scene, footprint_gap, goal_holds
+from relevance.scene import (
+    Action,
+    Box,
+    Goal,
+    Phase,
+    Pose,
+    Scene,
+    SceneError,
+    footprint_gap,
+    goal_holds,
+)
 
-PLANNER_VERSION = "1"
+PLANNER_VERSION = "2"
 COST_TOLERANCE = 1e-3
 """Costs are compared after rounding to this, rad^2."""
 GUIDES = ("none", "prune", "prune-then-full", "expand", "order")
@@ -79,6 +89,8 @@ class PlanResult:
     actions: tuple[Action, ...] = ()
     moved: tuple[str, ...] = ()
     """Moved objects, in order."""
+    alternatives: tuple[tuple[str, ...], ...] = ()
+    """Moved objects of every plan of this length that was found, in order; the best first."""
     final: dict[str, Pose]
     cost: float = math.nan
     """Squared joint accelerations, summed over rows, rad^2."""
@@ -101,13 +113,17 @@ def plan(
     *,
     config: PlannerConfig = PlannerConfig(),
     guide: Guide | None = None,
+    movable: Collection[str] | None = None,
 ) -> PlanResult:
     """Find the shortest sequence of picks and places, and its motion, that makes the goal true.
 
-    Raises SceneError for an unknown predicate or object. A goal that cannot be reached is a
-    result with a reason.
+    movable: the objects that may be moved (None: all). Raises SceneError for an unknown
+    predicate or object. A goal that cannot be reached is a result with a reason.
     """
     goal = scene.goal(goal)
+    everything = frozenset(scene.names if movable is None else movable)
+    for name in everything - set(scene.names):
+        raise SceneError(f"movable: no object {name!r}, expected some of {', '.join(scene.names)}")
     began = time.process_time()
     if goal_holds(scene.objects, goal):
         seconds = Seconds(total=time.process_time() - began)
@@ -116,13 +132,13 @@ def plan(
             seconds=seconds,
         )  # fmt: skip
     problem = Problem(scene, goal)
-    names, scores = scene.names, None
+    scores = None
     if guide is not None and guide.mode != "none":
         scored = time.process_time()
         scores = guide.scorer.scores(scene, goal)
         problem.seconds.guide = time.process_time() - scored
     result = None
-    for allowed in _rounds(names, goal, guide, scores):
+    for allowed in _rounds(everything, goal, guide, scores):
         search = _Search(problem, config, allowed, scores if _ordered(guide) else None)
         result = search.run(began)
         if result.status == "solved":
@@ -146,14 +162,13 @@ def _ordered(guide: Guide | None) -> bool:
     return guide is not None and guide.mode == "order"
 
 
-def _rounds(names, goal: Goal, guide: Guide | None, scores):
+def _rounds(everything: frozenset[str], goal: Goal, guide: Guide | None, scores):
     """The object sets that a guide lets the search move, one after the other."""
-    everything = frozenset(names)
     if guide is None or scores is None or guide.mode == "order":
         yield everything
         return
-    always = {goal.subject, goal.reference}
-    kept = frozenset(n for n in names if scores[n] > -guide.beta or n in always)
+    always = everything & {goal.subject, goal.reference}
+    kept = frozenset(n for n in everything if scores[n] > -guide.beta or n in always)
     yield kept
     if guide.mode == "prune-then-full" and kept != everything:
         yield everything
@@ -165,7 +180,7 @@ def _rounds(names, goal: Goal, guide: Guide | None, scores):
 
 class _Search:
     def __init__(self, problem: Problem, config: PlannerConfig, allowed, scores) -> None:
-        self.problem, self.config, self.scores = problem, config, scores
+        self.problem, self.config, self.allowed, self.scores = problem, config, allowed, scores
         self.order = [n for n in problem.boxes if n in allowed]
         if scores is not None:
             self.order.sort(key=lambda n: -scores[n])
@@ -194,13 +209,15 @@ class _Search:
                 ambiguous=problem.undecided or self.refused_late, counts=problem.counts,
                 seconds=problem.seconds,
             )  # fmt: skip
-        best = min(found, key=self._rank)
+        found.sort(key=self._rank)
+        best = found[0]
         sets = {frozenset(motion.order) for motion in found}
         return PlanResult(
             goal=goal,
             status="solved",
             actions=logic.actions(goal, best.order),
             moved=best.order,
+            alternatives=tuple(motion.order for motion in found),
             final=best.final,
             cost=best.cost,
             ambiguous=problem.undecided or self.refused_late or len(sets) > 1,
@@ -217,6 +234,8 @@ class _Search:
     def _hopeless(self) -> str:
         """Why no sequence can work even if everything else were gone; empty if one might."""
         problem, goal = self.problem, self.problem.goal
+        if goal.subject not in self.allowed:
+            return f"{goal.subject} may not be moved"
         if not problem.grasps[goal.subject]:
             return f"{goal.subject} cannot be grasped: too wide for the hand or out of reach"
         if not (self._within_reach() or self._reference_moves()):
@@ -234,7 +253,8 @@ class _Search:
 
     def _reference_moves(self) -> bool:
         reference = self.problem.goal.reference
-        return self.config.max_actions >= 4 and bool(self.problem.grasps[reference])
+        allowed = reference in self.allowed and self.config.max_actions >= 4
+        return allowed and bool(self.problem.grasps[reference])
 
     def _visit(self) -> None:
         self.problem.counts.nodes += 1

@@ -1,5 +1,8 @@
 """Separating-axis distances of boxes, with gradients; upright boxes are the obstacles.
 
+An obstacle is a row of UPRIGHT numbers: x, y, z, yaw, half extents (3), and, so that they are
+computed once, the radius of its footprint and the cosine and sine of its yaw.
+
 `separation` looks along the six face normals only. That is exact for two upright boxes and
 never above the true distance otherwise, so a margin kept here is a margin kept.
 """
@@ -7,17 +10,43 @@ never above the true distance otherwise, so a margin kept here is a margin kept.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+UPRIGHT = 10
+
 
 @njit(cache=True)
-def rectangle_gap(ax, ay, ayaw, ahx, ahy, bx, by, byaw, bhx, bhy):
-    """Separating-axis distance of two rectangles, m (exact depth when negative)."""
+def upright(x, y, z, yaw, hx, hy, hz, row):
+    """Fill an obstacle row."""
+    row[0], row[1], row[2], row[3] = x, y, z, yaw
+    row[4], row[5], row[6] = hx, hy, hz
+    row[7] = math.sqrt(hx * hx + hy * hy)
+    row[8], row[9] = math.cos(yaw), math.sin(yaw)
+
+
+class Bodies(NamedTuple):
+    """Boxes that move with the arm during one motion, each aligned with its link's axes."""
+
+    link: np.ndarray
+    """(B,) index in LINKS."""
+    centre: np.ndarray
+    """(B, 3) in the link's frame, m."""
+    half: np.ndarray
+    """(B, 3) m."""
+    radius: np.ndarray
+    """(B,) of the sphere around each, m."""
+
+
+@njit(cache=True)
+def rectangle_gap(ax, ay, ca, sa, ahx, ahy, bx, by, cb, sb, bhx, bhy):
+    """Separating-axis distance of two rectangles, m (exact depth when negative).
+
+    Centre, cosine and sine of the yaw, and half extents of one, then of the other.
+    """
     dx, dy = bx - ax, by - ay
-    ca, sa = math.cos(ayaw), math.sin(ayaw)
-    cb, sb = math.cos(byaw), math.sin(byaw)
     c, s = abs(ca * cb + sa * sb), abs(sa * cb - ca * sb)
     gap = abs(ca * dx + sa * dy) - ahx - c * bhx - s * bhy
     gap = max(gap, abs(ca * dy - sa * dx) - ahy - s * bhx - c * bhy)
@@ -29,12 +58,12 @@ def rectangle_gap(ax, ay, ayaw, ahx, ahy, bx, by, byaw, bhx, bhy):
 def separation(p, R, h, obstacle, n, x):
     """Distance of a box (centre p, axes R columns, half extents h) from an upright obstacle.
 
-    obstacle: (x, y, z, yaw, hx, hy, hz). Returns the distance; fills n (3,), the direction
+    obstacle (UPRIGHT,). Returns the distance; fills n (3,), the direction
     from the obstacle to the box, and x (3,), the contact point, such that for motions of
     box and obstacle d(distance) = n.(v + w x (x - p)) - n.(v' + w' x (x - p')).
     """
     dx, dy, dz = p[0] - obstacle[0], p[1] - obstacle[1], p[2] - obstacle[2]
-    c, s = math.cos(obstacle[3]), math.sin(obstacle[3])
+    c, s = obstacle[8], obstacle[9]
     # axes of the obstacle in rows: (c, s, 0), (-s, c, 0), (0, 0, 1)
     best, which = -1e9, 0
     for i in range(3):
@@ -94,54 +123,82 @@ def separation(p, R, h, obstacle, n, x):
 
 
 @njit(cache=True)
-def near(p, h, obstacle, reach):
-    """Whether the bounding spheres come within `reach` (the table is always near in height)."""
-    radius = math.sqrt(h[0] * h[0] + h[1] * h[1] + h[2] * h[2]) + reach
+def body_pose(frame, centre, p, R):
+    """World centre p (3,) and axes R (3, 3) of a body, from its link's frame (FRAME,)."""
+    for i in range(3):
+        for j in range(3):
+            R[i, j] = frame[3 + 3 * i + j]
+        p[i] = frame[i] + R[i, 0] * centre[0] + R[i, 1] * centre[1] + R[i, 2] * centre[2]
+
+
+@njit(cache=True)
+def point_gradient(frame, point, n, row):
+    """Gradient (7,) of n . (velocity of a point fixed to the link) with respect to q."""
+    rx, ry, rz = point[0] - frame[0], point[1] - frame[1], point[2] - frame[2]
+    # n . (w x r) = w . (r x n)
+    mx, my, mz = ry * n[2] - rz * n[1], rz * n[0] - rx * n[2], rx * n[1] - ry * n[0]
+    for i in range(7):
+        row[i] = (
+            n[0] * frame[12 + i]
+            + n[1] * frame[19 + i]
+            + n[2] * frame[26 + i]
+            + mx * frame[33 + i]
+            + my * frame[40 + i]
+            + mz * frame[47 + i]
+        )
+
+
+@njit(cache=True)
+def near(p, radius, obstacle):
+    """Whether a sphere (centre p, radius in m) may touch the obstacle; its footprint is a disk."""
     if abs(p[2] - obstacle[2]) > obstacle[6] + radius:
         return False
-    flat = math.sqrt(obstacle[4] * obstacle[4] + obstacle[5] * obstacle[5]) + radius
+    flat = obstacle[7] + radius
     dx, dy = p[0] - obstacle[0], p[1] - obstacle[1]
     return dx * dx + dy * dy <= flat * flat
 
 
 @njit(cache=True)
 def banded_solve(band, b):
-    """Solve A x = b in place, A symmetric positive definite; band[i, d] = A[i, i - d].
+    """Solve A x = b in place, A symmetric positive definite; band[j, d] = A[j + d, j].
 
-    Returns False when A is not positive definite.
+    band (n, width), overwritten; entries beyond the last row are ignored. Returns False when A
+    is not positive definite.
     """
     n, width = band.shape
-    for i in range(n):
-        for d in range(min(i, width - 1), -1, -1):
-            j = i - d
-            total = band[i, d]
-            for k in range(max(0, i - width + 1, j - width + 1), j):
-                total -= band[i, i - k] * band[j, j - k]
-            if d == 0:
-                if total <= 0:
-                    return False
-                band[i, 0] = math.sqrt(total)
-            else:
-                band[i, d] = total / band[j, 0]
-    for i in range(n):
-        total = b[i]
-        for k in range(max(0, i - width + 1), i):
-            total -= band[i, i - k] * b[k]
-        b[i] = total / band[i, 0]
-    for i in range(n - 1, -1, -1):
-        total = b[i]
-        for k in range(i + 1, min(n, i + width)):
-            total -= band[k, k - i] * b[k]
-        b[i] = total / band[i, 0]
+    column = np.empty(width)
+    for j in range(n):
+        if band[j, 0] <= 0:
+            return False
+        m = min(width, n - j)
+        inverse = 1.0 / math.sqrt(band[j, 0])
+        for k in range(m):
+            column[k] = band[j, k] * inverse
+            band[j, k] = column[k]
+        for k in range(1, m):
+            factor = column[k]
+            if factor != 0.0:
+                row = band[j + k]
+                for i in range(m - k):  # no reduction: vectorises with the same bits everywhere
+                    row[i] -= factor * column[k + i]
+    for j in range(n):
+        b[j] /= band[j, 0]
+        for k in range(1, min(width, n - j)):
+            b[j + k] -= band[j, k] * b[j]
+    for j in range(n - 1, -1, -1):
+        total = b[j]
+        for k in range(1, min(width, n - j)):
+            total -= band[j, k] * b[j + k]
+        b[j] = total / band[j, 0]
     return True
 
 
 @njit(cache=True)
 def dense_solve(A, b):
-    """Solve A x = b for symmetric positive definite A (overwritten) in place of b."""
+    """Solve A x = b for symmetric positive definite A (lower triangle) in place of b."""
     n = len(b)
     band = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            band[i, i - j] = A[i, j]
+    for j in range(n):
+        for i in range(j, n):
+            band[j, i - j] = A[i, j]
     return banded_solve(band, b)
