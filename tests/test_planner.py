@@ -109,7 +109,9 @@ def test_guide_that_keeps_everything_equals_no_guide(planned):
 
 def test_right_guide_saves_nodes_and_wrong_guide_costs_only_with_prune(planned):
     scene, goal, plain = next(
-        task for task in planned if len(task[2].moved) == 2 and not task[2].ambiguous
+        (scene, goal, plain)
+        for scene, goal, plain in planned
+        if len(plain.moved) == 2 and not plain.ambiguous and goal.reference not in plain.moved
     )
     tree = PlannerConfig(search="tree")
     unguided = plan(scene, goal, config=tree)

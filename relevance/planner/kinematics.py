@@ -60,12 +60,17 @@ class Panda:
     """x = (q (7), base (4), target (4)); y = residual (6), d/dq (6 x 7), d/dtarget (6 x 4)."""
 
 
+LIMIT_MARGIN = 1e-3
+"""How far inside the joint limits the solvers aim, rad: more than they may be off."""
+
+
 class Arm(NamedTuple):
     """What the solvers use of a Panda at its place; every array is float64 or a handle."""
 
     base: np.ndarray
     """(4,) x, y, z, yaw."""
     lower: np.ndarray
+    """(7,) joint limits with LIMIT_MARGIN to spare, rad."""
     upper: np.ndarray
     velocity: np.ndarray
     frames_x: np.ndarray
@@ -81,8 +86,8 @@ def arm_at(base: np.ndarray) -> Arm:
     arm = panda()
     frames, grasp = arm.frames, arm.grasp
     return Arm(
-        base, arm.lower, arm.upper, arm.velocity, frames.x, frames.y, frames.handle, grasp.x,
-        grasp.y, grasp.handle,
+        base, arm.lower + LIMIT_MARGIN, arm.upper - LIMIT_MARGIN, arm.velocity, frames.x, frames.y,
+        frames.handle, grasp.x, grasp.y, grasp.handle,
     )  # fmt: skip
 
 

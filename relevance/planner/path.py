@@ -344,15 +344,12 @@ def motion(X, arm, leave, leaving, arrive, bodies, obstacles):
         if solve(X, arm, bodies, obstacles, margin, samples, n, targets) > 1.5e-3:
             return -1.0
         depth = dense_check(X, arm, bodies, obstacles, margin, broken)
-        good = depth <= 0.5 * ALLOWED
-        for t in range(ROWS):
-            if broken[t, 1] > 1.2e-3:
-                good = False
-                if n < len(samples) and 0 < broken[t, 0] < 1:
-                    samples[n, 0], samples[n, 1] = t, broken[t, 0]
-                    n += 1
-        if good:
+        if depth <= 0.5 * ALLOWED and np.max(broken[:, 1]) < 1.2e-3:
             return depth
+        for t in range(ROWS):
+            if broken[t, 1] > TOLERANCE and n < len(samples) and 0 < broken[t, 0] < 1:
+                samples[n, 0], samples[n, 1] = t, broken[t, 0]
+                n += 1
     return depth if depth <= 0.8 * ALLOWED else -1.0
 
 

@@ -145,8 +145,8 @@ def clearance(x, y, angle, bottom, parts, obstacles):
         radius = math.sqrt(along * along + across * across)
         for k in range(len(obstacles)):
             o = obstacles[k]
-            # The box itself comes down onto its support; the gripper stays clear of what is below.
-            if o[2] + o[6] <= bottom + under + (1e-3 if i == 0 and under == 0.0 else -MARGIN):
+            above = o[2] + o[6] - bottom - under
+            if above <= -MARGIN or (under == 0.0 and abs(above) < 1e-6):  # the box's own support
                 continue
             flat = radius + o[7] + best
             dx, dy = o[0] - px, o[1] - py

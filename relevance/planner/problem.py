@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -33,6 +33,8 @@ REGION_MARGIN = 0.001
 TABLE_MARGIN = 0.005
 REACH_MARGIN = 0.004
 """Distance kept from the ends of the arm's reach, m."""
+REFERENCE_PLACES = ((0.0, 0.0), (-0.1, 0.25), (-0.1, -0.25), (0.1, 0.15), (0.1, -0.15))
+"""Where to look for room for a reference that is moved (x, y), m."""
 SKY = 2.0
 """Height up to which the hand and what is above it count as an obstacle, m."""
 
@@ -225,19 +227,26 @@ class Problem:
                 return [*found, Placement(grasp=grasp, pose=pose)]
         return None
 
-    def _references(self, order: tuple[str, ...]) -> list[Box]:
+    def _references(self, order: tuple[str, ...]) -> Iterator[Box]:
         """The reference where it stands, or where it might be put if the order moves it."""
         reference = self.boxes[self.goal.reference]
         if reference.name not in order:
-            return [reference]
-        found, standing = [], self._standing(order)
-        for grasp in self.pickable(reference.name, frozenset(order[: order.index(reference.name)])):
-            for prefer in ((0.0, 0.0), (-0.1, 0.25), (-0.1, -0.25), (0.1, 0.15), (0.1, -0.15)):
-                pose = self._find(self._table(), prefer, 0.0, reference, grasp, standing)
-                if pose is not None:
-                    found.append(_moved_box(reference, grasp, pose, 0.0, None))
-            break
-        return found
+            yield reference
+            return
+        i = order.index(reference.name)
+        obstacles = self._when_landing(order, i, reference)
+        grasp = self.pickable(reference.name, frozenset(order[:i]))[0]
+        for prefer in REFERENCE_PLACES:
+            pose = self._find(self._table(), prefer, 0.0, reference, grasp, obstacles)
+            if pose is not None:
+                yield _moved_box(reference, grasp, pose, 0.0, None)
+
+    def _when_landing(self, order: tuple[str, ...], i: int, box: Box) -> np.ndarray:
+        """What the i-th moved box must stay clear of: the boxes that still stand then, and where
+        the gripper will be when it takes the later ones."""
+        top = box.size[2] + placement.MARGIN
+        hands = np.vstack([np.empty((0, UPRIGHT)), *self._later_picks(order[i + 1 :])])
+        return np.vstack([self._standing(order[: i + 1]), hands[_underside(hands) < top]])
 
     def _table(self) -> np.ndarray:
         return np.array([0.0, 0.0, 0.0, *(self.table - TABLE_MARGIN)])
@@ -248,16 +257,19 @@ class Problem:
         landed = np.empty((0, UPRIGHT))
         for i, name in enumerate(order[:-1]):
             box = self.boxes[name]
-            top = box.size[2] + placement.MARGIN
-            hands = np.vstack([kept, *self._later_picks(order[i + 1 :])])
-            low = hands[hands[:, 2] - hands[:, 6] < top]
-            obstacles = np.vstack([self._standing(order[: i + 1]), landed, low])
+            prefer, area, reserved = box.position[:2], self._table(), kept
+            if name == reference.name:
+                prefer, reserved = reference.position[:2], kept[:0]  # kept was laid out around it
+                area = np.array([*prefer, 0.0, 0.002, 0.002])
+            elif reference.name in order[i:]:
+                grasp = self.grasps[reference.name][0]
+                pose = (*reference.position[:2], reference.yaw + grasp.axis * math.pi / 2)
+                there = placement.volumes(grasp.parts, pose, 0.0, reference.top, SKY)
+                reserved = np.vstack([kept, there])
+            reserved = reserved[_underside(reserved) < box.size[2] + placement.MARGIN]
+            obstacles = np.vstack([self._when_landing(order, i, box), landed, reserved])
             found = None
             for grasp in self.pickable(name, frozenset(order[:i])):
-                prefer, area = box.position[:2], self._table()
-                if name == reference.name:
-                    prefer = reference.position[:2]
-                    area = np.array([*prefer, 0.0, 0.002, 0.002])
                 pose = self._find(area, prefer, 0.0, box, grasp, obstacles)
                 if pose is not None:
                     found = Placement(grasp=grasp, pose=pose)
@@ -301,12 +313,15 @@ class Problem:
         table = np.zeros((m, 2))
         x = np.zeros(17 * m)
         p0, weight = np.zeros(3 * m), np.zeros(3 * m)
+        reference = self.boxes[self.goal.reference]
+        if reference.name in order:
+            place = placements[order.index(reference.name)]
+            reference = _moved_box(reference, place.grasp, place.pose, 0.0, None)
         for j, (name, place) in enumerate(zip(order, placements, strict=True)):
             box, grasp = self.boxes[name], place.grasp
             bottom = 0.0
             if name == self.goal.subject and self.goal.predicate is Predicate.ON:
-                supports[j] = self.index[self.goal.reference]
-                bottom = self.boxes[self.goal.reference].top
+                supports[j], bottom = self.index[reference.name], reference.top
             moved[self.index[name]] = j
             pick[j] = self.pick_target(box, grasp)
             place_z[j] = bottom + box.size[2] / 2 + grasp.above
@@ -324,13 +339,9 @@ class Problem:
             target = np.array([*place.pose[:2], place_z[j], place.pose[2]])
             for k, t in ((2 * j, pick[j]), (2 * j + 1, target)):
                 q = x[k * ARM : (k + 1) * ARM]
-                if not hand_down(t, self.arm.base, arm.lower, arm.upper, q):
+                if not hand_down(t, self.arm.base, self.arm.lower, self.arm.upper, q):
                     return None
         x[14 * m :] = p0
-        reference = self.boxes[self.goal.reference]
-        if reference.name in order:
-            j = order.index(reference.name)
-            reference = _moved_box(reference, placements[j].grasp, placements[j].pose, 0.0, None)
         switches = keyframes.Switches(
             HOME, pick, place_z, turn, link, centre, half, radius, n_bodies, self.obstacles, stands,
             moved, supports, self.goal_region(reference), table,
@@ -423,6 +434,11 @@ class Problem:
     def _phase(self, X, action: Action | None, opening: float, carried: str | None) -> Phase:
         dt = path.time_step(self.arm, X)
         return Phase(action=action, q=X, dt=dt, opening=opening, carried=carried)
+
+
+def _underside(rows: np.ndarray) -> np.ndarray:
+    """Heights of the undersides of obstacle rows, m."""
+    return rows[:, 2] - rows[:, 6]
 
 
 def _carried(box: Box, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
