@@ -127,11 +127,11 @@ class Problem:
     def _fixtures(self) -> list[np.ndarray]:
         """What always stands there, as obstacles: the table and the robot's foot."""
         table, foot = np.empty(UPRIGHT), np.empty(UPRIGHT)
-        upright(0.0, 0.0, -0.05, 0.0, *self.table, 0.05, table)
-        (x, y, z), half = panda().foot
+        upright(0.0, 0.0, -0.05, 0.0, self.table[0], self.table[1], 0.05, table)
+        (x, y, z), (hx, hy, hz) = panda().foot
         bx, by, bz, yaw = self.arm.base
         c, s = math.cos(yaw), math.sin(yaw)
-        upright(bx + c * x - s * y, by + s * x + c * y, bz + z, yaw, *half, foot)
+        upright(bx + c * x - s * y, by + s * x + c * y, bz + z, yaw, hx, hy, hz, foot)
         return [table, foot]
 
     def _standing(self, gone: Collection[str]) -> np.ndarray:
@@ -417,7 +417,9 @@ class Problem:
             turned = finger_angle(self.arm, q[2 * j + 1]) - finger_angle(self.arm, q[2 * j])
             yaw = (box.yaw + turned + math.pi) % (2 * math.pi) - math.pi
             position = (float(poses[j, 0]), float(poses[j, 1]), bottom + box.size[2] / 2)
-            upright(*position, yaw, *obstacles[i, 4:7], obstacles[i])
+            x, y, z = position
+            hx, hy, hz = obstacles[i, 4:7]
+            upright(x, y, z, yaw, hx, hy, hz, obstacles[i])
             final[name] = Pose(position=position, yaw=yaw, on=on)
             X = np.empty((2 * path.VERTICAL + 1, ARM))
             X[0] = at

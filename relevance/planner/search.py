@@ -5,18 +5,20 @@ pose, keyframe, path; a refused prefix is dropped with all below it. The level i
 is found is finished, and the plan of lowest cost counts (rounded, ties by object index), so
 that labels do not depend on the order of search.
 
-`tree` extends every prefix by every object (the paper's uninformed search). `informed` extends
-only by objects that could matter: those that reach into the goal region or into the way of a
-pick that is needed.
+`tree` extends every sequence by every object (the paper's uninformed search). `informed` goes
+through sets of objects, not sequences, and adds to a set only what could help: what reaches
+into the goal region, or is in the way of a pick that the set needs. It plans one order of a
+set, the others only when that fails.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 from typing import Literal, Protocol
 
 from relevance.planner import logic
@@ -34,6 +36,8 @@ from relevance.scene import (
 )
 
 PLANNER_VERSION = "2"
+ORDERS = 6
+"""How many orders of a set `informed` tries."""
 COST_TOLERANCE = 1e-3
 """Costs are compared after rounding to this, rad^2."""
 GUIDES = ("none", "prune", "prune-then-full", "expand", "order")
@@ -184,9 +188,6 @@ class _Search:
         self.order = [n for n in problem.boxes if n in allowed]
         if scores is not None:
             self.order.sort(key=lambda n: -scores[n])
-        if config.search == "informed":
-            candidates = could_matter(problem)
-            self.order = [n for n in self.order if n in candidates]
         self.index = {name: i for i, name in enumerate(problem.boxes)}
         self.reason = ""
         self.refused_late = False
@@ -267,23 +268,27 @@ class _Search:
         The reference is a landmark: sequences that move it count only when no other does it.
         """
         reference, found = self.problem.goal.reference, []
+        levels = self._sequences if self.config.search == "tree" else self._sets
         if self._within_reach():
-            found = self._levels([name for name in self.order if name != reference], frozenset())
+            found = levels([name for name in self.order if name != reference], frozenset())
         if not found and self._reference_moves():
-            found = self._levels(self.order, frozenset({reference}))
+            found = levels(self.order, frozenset({reference}))
         return found
 
-    def _levels(self, movable: list[str], required: frozenset[str]) -> list[Motion]:
+    def _sequences(self, movable: list[str], required: frozenset[str]) -> list[Motion]:
+        """Breadth-first over sequences of objects moved before the subject."""
         subject = self.problem.goal.subject
         frontier: list[tuple[str, ...]] = [()]
         for _ in range(self.config.max_actions // 2):
             found, following = [], []
             for prefix in frontier:
-                motion = self._finish(prefix) if required <= set(prefix) else None
-                if motion is not None:
-                    found.append(motion)
-                    if self.scores is not None:
-                        return found
+                self._visit()
+                if required <= set(prefix):
+                    motion = self._finish(frozenset(prefix), [prefix])
+                    if motion is not None:
+                        found.append(motion)
+                        if self.scores is not None:
+                            return found
                 for name in movable:
                     if name == subject or name in prefix:
                         continue
@@ -296,61 +301,94 @@ class _Search:
             frontier = following
         return []
 
-    def _finish(self, prefix: tuple[str, ...]) -> Motion | None:
-        """Pick the subject now and place it at the goal: all bounds in turn."""
+    def _sets(self, movable: list[str], required: frozenset[str]) -> list[Motion]:
+        """Breadth-first over sets of objects moved before the subject, grown by what could help."""
+        subject, near = self.problem.goal.subject, beside_goal(self.problem)
+        rank = {name: i for i, name in enumerate(movable) if name != subject}
+        frontier: list[frozenset[str]] = [frozenset()]
+        for _ in range(self.config.max_actions // 2):
+            found, following = [], set()
+            for chosen in frontier:
+                self._visit()
+                if required <= chosen:
+                    motion = self._finish(chosen, islice(self._orders(chosen), ORDERS))
+                    if motion is not None:
+                        found.append(motion)
+                        if self.scores is not None:
+                            return found
+                helpful = near | self._in_the_way(chosen)
+                following |= {chosen | {name} for name in helpful - chosen if name in rank}
+            if found:
+                return found
+            frontier = sorted(following, key=lambda names: sorted(rank[name] for name in names))
+        return []
+
+    def _in_the_way(self, chosen: frozenset[str]) -> frozenset[str]:
+        """What blocks the picks that a set needs: the subject's by any grasp, and its own."""
         problem, goal = self.problem, self.problem.goal
-        self._visit()
-        gone = frozenset(prefix)
+        needed = [goal.subject, *(n for n in chosen if not problem.pickable(n, chosen))]
+        found = frozenset().union(*(problem.above[name].union(*problem.blockers[name])
+                                    for name in needed))  # fmt: skip
+        return found | logic.goal_blockers(problem.scene, goal)
+
+    def _orders(self, chosen: frozenset[str]) -> Iterator[tuple[str, ...]]:
+        """The orders in which a set can be picked."""
+
+        def extend(prefix: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+            if len(prefix) == len(chosen):
+                yield prefix
+            for name in self.order:
+                if name not in chosen or name in prefix:
+                    continue
+                if self.problem.pickable(name, frozenset(prefix)):
+                    yield from extend((*prefix, name))
+
+        return extend(())
+
+    def _finish(self, gone: frozenset[str], prefixes: Iterable[tuple[str, ...]]) -> Motion | None:
+        """Pick the subject once `gone` have left and place it at the goal: all bounds in turn."""
+        problem, goal = self.problem, self.problem.goal
         if not logic.goal_blockers(problem.scene, goal) <= gone:
             return None
         options = problem.pickable(goal.subject, gone)
+        if goal.reference not in gone:
+            reference = problem.boxes[goal.reference]
+            options = [g for g in options if problem.goal_pose(gone, g, reference) is not None]
         if not options:
             return None
         self._visit()
-        order = (*prefix, goal.subject)
-        for grasp in options:
-            if goal.reference not in gone and (
-                problem.goal_pose(gone, grasp, problem.boxes[goal.reference]) is None
-            ):
-                continue
-            placements = problem.place_all(order, grasp)
-            if placements is None:
-                problem.undecided = True
-                continue
-            solved = problem.keyframes(order, placements)
-            if solved is not None:
-                motion = problem.paths(order, placements, *solved)
-                if motion is not None:
-                    return motion
-            self.refused_late = True
+        for prefix in prefixes:
+            order = (*prefix, goal.subject)
+            for grasp in options:
+                placements = problem.place_all(order, grasp)
+                if placements is None:
+                    problem.undecided = True
+                    continue
+                solved = problem.keyframes(order, placements)
+                if solved is not None:
+                    motion = problem.paths(order, placements, *solved)
+                    if motion is not None:
+                        return motion
+                self.refused_late = True
         return None
 
 
-def could_matter(problem: Problem) -> frozenset[str]:
-    """Objects whose leaving can change a pose bound: those near the goal region, those in the
-    way of a needed pick, and, in turn, those in the way of taking these; and the reference."""
+def beside_goal(problem: Problem) -> frozenset[str]:
+    """Objects whose leaving can make room in the goal region; and the reference."""
     goal = problem.goal
     subject, reference = problem.boxes[goal.subject], problem.boxes[goal.reference]
-    found = {reference.name, subject.name}
-    if problem.grasps[subject.name]:
-        x, y, angle, a, b = problem.goal_region(reference)
-        spread = max(
-            math.hypot(abs(part[0]) + part[1], part[2])
-            for grasp in problem.grasps[subject.name]
-            for part in grasp.parts
-        )
-        area = Box(
-            name="area",
-            size=(2 * (a + spread) + 0.02, 2 * (b + spread) + 0.02, 1.0),
-            position=(x, y, 0.5),
-            yaw=angle,
-            color=(0.0, 0.0, 0.0),
-        )
-        found |= {box.name for box in problem.scene.objects if footprint_gap(area, box) <= 0}
-    while True:
-        more = set(found)
-        for name in found:
-            more |= problem.above[name].union(*problem.blockers[name])
-        if more == found:
-            return frozenset(found)
-        found = more
+    x, y, angle, a, b = problem.goal_region(reference)
+    spread = max(
+        math.hypot(abs(part[0]) + part[1], part[2])
+        for grasp in problem.grasps[subject.name]
+        for part in grasp.parts
+    )
+    area = Box(
+        name="area",
+        size=(2 * (a + spread) + 0.02, 2 * (b + spread) + 0.02, 1.0),
+        position=(x, y, 0.5),
+        yaw=angle,
+        color=(0.0, 0.0, 0.0),
+    )
+    near = {box.name for box in problem.scene.objects if footprint_gap(area, box) <= 0}
+    return frozenset(near | {reference.name}) - {subject.name}
