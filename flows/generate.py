@@ -8,7 +8,15 @@ from prefect import flow, get_run_logger, task
 from prefect.artifacts import create_table_artifact
 from prefect.cache_policies import NO_CACHE
 
-from flows.parameters import DatasetPath, Overrides, Preset, Workers, absolute, configured
+from flows.parameters import (
+    Cluster,
+    DatasetPath,
+    Overrides,
+    Preset,
+    Workers,
+    absolute,
+    configured,
+)
 from flows.shards import announce, process_pool, run_shards, worth_retrying
 
 if TYPE_CHECKING:
@@ -41,32 +49,36 @@ def generate(
     preset: Preset = "demo",
     overrides: Overrides | None = None,
     max_workers: Workers | None = None,
+    cluster: Cluster | None = None,
 ) -> dict[str, Any]:
     """Make the scenes and images of a dataset; shards that are there are skipped.
 
     Args:
-        dataset: Folder of the dataset; made when it is not there, appended to when it is smaller.
+        dataset: Folder of the dataset, or s3://bucket/prefix; made when it is not there, appended
+            to when it is smaller.
         preset: Size and settings: smoke, demo, laptop or paper.
         overrides: Settings that differ from the preset, e.g. {"seed": 7}; keys may be dotted.
         max_workers: Processes that work at a time; the number of cores when empty.
+        cluster: Address of a Dask scheduler whose workers make the shards instead, each of which
+            reaches the dataset (and Prefect's server).
     """
-    from relevance.generation import DatasetConfig, prepare
+    from relevance.generation import DatasetConfig, finish, generated, prepare
     from relevance.store import Dataset
 
     root = absolute(dataset)
     config = configured(DatasetConfig, preset, overrides)
-    specs = prepare(root, config)
+    specs = prepare(root, config, scenes_only=True)
     there = Dataset.open(root)
     jobs = {
         f"{spec.split}-{spec.shard:06d}": {"root": str(root), "config": config, "spec": spec}
         for spec in specs
-        if not (
-            there.has("scenes", split=spec.split, shard=spec.shard)
-            and there.images_path(spec.split, spec.shard).is_file()
-        )
+        if not generated(there, spec)
     }
     done = len(specs) - len(jobs)
-    reports = run_shards(generate_one, jobs, stage="generate", done=done, max_workers=max_workers)
+    reports = run_shards(
+        generate_one, jobs, stage="generate", done=done, max_workers=max_workers, cluster=cluster
+    )
+    finish(root)
     rows = [
         {
             "split": split,

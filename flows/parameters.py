@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_type_hints
@@ -27,8 +28,15 @@ def _folder(text: str) -> str:
     return text
 
 
+def _cluster(text: str) -> str:
+    if not re.fullmatch(r"[a-z]+://[^\s/]+:\d+", text):
+        raise ValueError("expected the address of a Dask scheduler, like tcp://10.0.0.1:8786")
+    return text
+
+
 DatasetPath = Annotated[str, AfterValidator(_folder)]
 Workers = Annotated[int, Field(ge=1, le=1024)]
+Cluster = Annotated[str, AfterValidator(_cluster)]
 
 C = TypeVar("C")
 
@@ -85,5 +93,10 @@ def _checked(hint: Any, value: Any, where: str) -> Any:
 
 
 def absolute(path: str | Path) -> Path:
-    """The path as tasks get it: absolute, since a worker may run in another folder."""
-    return Path(path).expanduser().absolute()
+    """The path as tasks get it: absolute, since a worker may run in another folder.
+
+    `s3://bucket/prefix` stays what it is.
+    """
+    from relevance.store import absolute as located
+
+    return located(path)

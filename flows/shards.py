@@ -36,6 +36,9 @@ MOST_FAILURES = 5
 MOST_POOLS = 3
 """How often a pool whose worker died (out of memory, say) is replaced."""
 
+MOST_FLYING = 256
+"""Workers of a cluster that are kept busy: four shards each are handed out ahead."""
+
 Listener = Callable[[str, int, int], None]
 listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 """Hears (stage, done, total) in the flow's own process; the command line draws bars with it."""
@@ -69,6 +72,15 @@ def process_pool(max_workers: int | None = None) -> TaskRunner[Any]:
     return ProcessPoolTaskRunner(max_workers=workers, initializer=prepare_worker)
 
 
+def dask_cluster(address: str) -> TaskRunner[Any]:
+    """The workers of a running Dask cluster; raises ShardsFailed when they cannot be had."""
+    try:
+        from prefect_dask.task_runners import DaskTaskRunner
+    except ImportError:
+        raise ShardsFailed("a Dask cluster needs prefect-dask: install relevance[dask]") from None
+    return DaskTaskRunner(address=address)
+
+
 def worth_retrying(task: Task[Any, Any], run: Any, state: Any) -> bool:
     """Whether another try could help: bad input (a ValueError) stays bad."""
     return not isinstance(state.result(raise_on_failure=False), ValueError)
@@ -95,11 +107,14 @@ def one_server() -> Iterator[None]:
 
 
 @contextmanager
-def _runner(max_workers: int | None) -> Iterator[TaskRunner[Any]]:
-    """A fresh process pool, or the runner that the flow was given instead (threads, Dask, Ray)."""
+def _runner(max_workers: int | None, cluster: str | None) -> Iterator[TaskRunner[Any]]:
+    """A fresh process pool, a Dask cluster, or the runner that the flow was given instead."""
     context = FlowRunContext.get()
     assert context is not None, "shards are run inside a flow"
-    if isinstance(context.task_runner, ProcessPoolTaskRunner):
+    if cluster is not None:
+        with one_server(), dask_cluster(cluster) as workers:
+            yield workers
+    elif isinstance(context.task_runner, ProcessPoolTaskRunner):
         with one_server(), process_pool(max_workers) as pool:
             yield pool
     else:
@@ -113,6 +128,7 @@ def run_shards(
     stage: str,
     done: int = 0,
     max_workers: int | None = None,
+    cluster: str | None = None,
 ) -> dict[str, Any]:
     """Run the task once a job (name -> parameters), in any order; results by name.
 
@@ -132,8 +148,9 @@ def run_shards(
             if not left or len(failures) >= MOST_FAILURES:
                 break
             try:
-                with _runner(max_workers) as runner:
-                    for name, outcome in _outcomes(runner, task, left, max_workers):
+                with _runner(max_workers, cluster) as runner:
+                    under_way = max_workers or (MOST_FLYING if cluster else None)
+                    for name, outcome in _outcomes(runner, task, left, under_way):
                         if isinstance(outcome, BaseException):
                             failures[name] = outcome
                             get_run_logger().error("%s: shard %s: %s", stage, name, outcome)

@@ -107,7 +107,7 @@ def load_examples(
         from labels where split = ? and policy = ? and (? or not ambiguous)
         group by all order by all
     """
-    with dataset.connect() as connection:
+    with dataset.connect(policy=policy) as connection:
         rows = connection.execute(query, [split, policy, ambiguous]).fetchall()
     labels: dict[str, list[tuple[Any, ...]]] = {
         key: list(group) for key, group in groupby(rows, key=lambda row: row[0])

@@ -1,7 +1,7 @@
 """From a planner's result to rows: plans (failures too), timings, and relevance labels.
 
 Labels are read from plan rows, not from planner objects: another policy makes new labels from
-stored plans, with no planning and no rendering.
+stored plans, with no rendering (and no planning, unless the policy asks for it).
 """
 
 from __future__ import annotations
@@ -9,14 +9,51 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from relevance.planner import PLANNER_VERSION, PlanResult
+from relevance.planner import PLANNER_VERSION, PlannerConfig, PlanResult, plan
 from relevance.scene import Scene, content_hash, scene_from_json, scene_to_json
 from relevance.simulation import Rendering, Replay
 
-POLICIES = ("found",)
-"""`found`: relevant is what the plan that was found manipulates (the paper's Z_S)."""
+POLICIES = ("found", "necessary", "any-minimal")
+"""`found`: relevant is what the plan that was found manipulates (the paper's Z_S).
+`necessary`: relevant is what no plan of the allowed length can do without (leave one out).
+`any-minimal`: relevant is what some plan of the least length manipulates."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """Whether an object is relevant, and what says so."""
+
+    relevant: bool
+    because: str
+
+
+def necessary(scene: Scene, found: Mapping[str, Any], config: PlannerConfig) -> dict[str, Verdict]:
+    """Leave one out: plan the goal of a plan row again without moving each object that it moved.
+
+    Every other object is one that the found plan does without. An object counts as necessary
+    too when the search for a plan without it ended at its node limit; the verdict says so.
+    """
+    goal = scene.goal(f"{found['predicate']}({found['subject']}, {found['reference']})")
+    verdicts = {}
+    for name in scene.names:
+        if name not in found["moved"]:
+            verdicts[name] = Verdict(relevant=False, because="the plan does without it")
+            continue
+        others = frozenset(scene.names) - {name}
+        without = plan(scene, goal, config=config, movable=others)
+        if without.status == "solved" and without.check_ok:
+            moves = ", ".join(without.moved)
+            verdicts[name] = Verdict(relevant=False, because=f"a plan without it moves {moves}")
+        elif without.status == "limit":
+            verdicts[name] = Verdict(relevant=True, because=f"undecided: {without.reason}")
+        else:
+            verdicts[name] = Verdict(
+                relevant=True, because=f"no plan of up to {config.max_actions} actions without it"
+            )
+    return verdicts
 
 
 def scene_row(
@@ -98,6 +135,7 @@ def plan_row(
         "reason": result.reason,
         "actions": [action.to_list() for action in result.actions],
         "moved": list(result.moved),
+        "alternatives": [list(names) for names in result.alternatives],
         "final": [
             {"name": name, "position": list(pose.position), "yaw": pose.yaw, "on": pose.on}
             for name, pose in sorted(result.final.items())
@@ -136,29 +174,52 @@ def timing_row(
 
 
 def label_rows(
-    scene: Mapping[str, Any], plan: Mapping[str, Any], policy: str = "found"
+    scene: Mapping[str, Any],
+    plan: Mapping[str, Any],
+    policy: str = "found",
+    verdicts: Mapping[str, Verdict] | None = None,
 ) -> list[dict[str, Any]]:
     """One row an object of the scene, in its order; none when the plan does not hold.
 
-    `scene` and `plan` are rows of `scenes` and `plans`. Raises ValueError for another policy.
+    `scene` and `plan` are rows of `scenes` and `plans`; policy `necessary` takes the verdicts of
+    `necessary`. Raises ValueError for another policy.
     """
     if policy not in POLICIES:
         raise ValueError(f"policy {policy!r}: expected one of {', '.join(POLICIES)}")
     assert plan["scene_id"] == scene["scene_id"], "a plan is labelled with its own scene"
     if not plan["holds"]:
         return []
+    names = [box["name"] for box in scene["objects"]]
+    if policy == "necessary":
+        assert verdicts is not None, "necessary takes the verdicts of leaving one out"
+    elif policy == "any-minimal":
+        verdicts = {name: _in_any(name, plan) for name in names}
+    else:
+        # the plan's own row says why
+        verdicts = {name: Verdict(relevant=name in plan["moved"], because="") for name in names}
     goal_objects = (plan["subject"], plan["reference"])
     return [
         {
             **{key: plan[key] for key in _FROM_PLAN},
             "query": box["name"],
-            "relevant": box["name"] in plan["moved"],
+            "relevant": verdicts[box["name"]].relevant,
             "is_goal_object": box["name"] in goal_objects,
             "policy": policy,
+            "because": verdicts[box["name"]].because or None,
             "visible_fraction": box["visible_fraction"],
         }
         for box in scene["objects"]
     ]
+
+
+def _in_any(name: str, plan: Mapping[str, Any]) -> Verdict:
+    if name in plan["moved"]:
+        return Verdict(relevant=True, because="the plan moves it")
+    for moved in plan["alternatives"] or ():
+        if name in moved:
+            others = ", ".join(moved)
+            return Verdict(relevant=True, because=f"a plan as short moves {others}")
+    return Verdict(relevant=False, because="no plan as short moves it")
 
 
 _FROM_PLAN = (

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
@@ -109,7 +109,7 @@ class Box:
     yaw: float = 0.0
     """Rotation about z, rad."""
     color: Color
-    """Linear RGB in 0..1."""
+    """RGB in 0..1, as in an image file."""
     on: str | None = None
     """Name of the box that it stands on; None for the table."""
 
@@ -133,15 +133,41 @@ class Box:
     def corners(self) -> np.ndarray:
         """Footprint corners in the world frame, (4, 2), m."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
-        half = np.array([self.size[0], self.size[1]]) / 2
-        signs = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
-        return signs * half @ np.array([[c, s], [-s, c]]) + np.array(self.position[:2])
+        (hx, hy), (x, y) = (edge / 2 for edge in self.size[:2]), self.position[:2]
+        a, b, d, e = c * hx, s * hy, s * hx, c * hy
+        return np.array(
+            [
+                [x + a - b, y + d + e],
+                [x - a - b, y - d + e],
+                [x - a + b, y - d - e],
+                [x + a + b, y + d - e],
+            ]
+        )
 
     def covers(self, x: float, y: float) -> bool:
         """Whether the point (x, y) lies over its footprint."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         dx, dy = x - self.position[0], y - self.position[1]
         return abs(c * dx + s * dy) <= self.size[0] / 2 and abs(c * dy - s * dx) <= self.size[1] / 2
+
+
+TEXTURES = ("checks", "stripes", "noise")
+"""Patterns that a table can have: squares, bands across its angle, cloudy spots."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_CHECKED)
+class Texture:
+    """A pattern on the table: parameters, not pixels, so that it can be drawn again exactly."""
+
+    kind: Literal["checks", "stripes", "noise"]
+    color: Color
+    """The second colour; the first is the table's own."""
+    scale: Length
+    """Edge of a square, width of a band or size of a spot, m."""
+    angle: float = 0.0
+    """Turn of the pattern about z, rad."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    """Where the pattern lies; which one it is, for `noise`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_CHECKED)
@@ -151,6 +177,8 @@ class Table:
     size: tuple[Length, Length] = (0.8, 1.2)
     """Full edge lengths along x and y, m."""
     color: Color = (0.93, 0.92, 0.89)
+    texture: Texture | None = None
+    """None: of one colour."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_CHECKED)
@@ -175,6 +203,8 @@ class Light:
     """From the scene towards the light."""
     color: Color = (1.0, 1.0, 1.0)
     distance: Length = 2.0
+    """How far the light is from the world's origin, m; shadows spread from there, while the
+    shade of a face depends on the direction alone."""
     ambient: Unit = 0.6
     diffuse: Unit = 0.4
     specular: Unit = 0.05
@@ -210,6 +240,8 @@ class Scene:
             self.goal(text)
         if not self.id:
             body = TypeAdapter(Scene).dump_python(self, mode="json", exclude={"id", "goals"})
+            if self.table.texture is None:  # a plain table hashes as it did before there were any
+                del body["table"]["texture"]
             object.__setattr__(self, "id", content_hash(body))
         return self
 
@@ -330,12 +362,17 @@ def footprint_gap(a: Box, b: Box) -> float:
 
     A lower bound of the true distance when positive, the exact depth when negative.
     """
-    ca, cb = a.corners(), b.corners()
+    dx, dy = b.position[0] - a.position[0], b.position[1] - a.position[1]
+    c, s = abs(math.cos(b.yaw - a.yaw)), abs(math.sin(b.yaw - a.yaw))
     best = -math.inf
-    for yaw in (a.yaw, b.yaw):
-        for axis in ((math.cos(yaw), math.sin(yaw)), (-math.sin(yaw), math.cos(yaw))):
-            pa, pb = ca @ axis, cb @ axis
-            best = max(best, float(pa.min() - pb.max()), float(pb.min() - pa.max()))
+    for one, other in ((a, b), (b, a)):
+        along, across = math.cos(one.yaw), math.sin(one.yaw)
+        hx, hy = other.size[0] / 2, other.size[1] / 2
+        best = max(
+            best,
+            abs(along * dx + across * dy) - one.size[0] / 2 - c * hx - s * hy,
+            abs(along * dy - across * dx) - one.size[1] / 2 - s * hx - c * hy,
+        )
     return best
 
 
@@ -345,7 +382,10 @@ def _check_boxes(objects: tuple[Box, ...], table: Table) -> None:
         where = f"objects.{i} ({box.name!r})"
         if box.name in names[:i] or box.name == "table":
             raise SceneError(f"{where}: name is taken, expected distinct names other than 'table'")
-        if (np.abs(box.corners()) > np.array(table.size) / 2 + CONTACT_TOLERANCE).any():
+        reach = (abs(at) + extent for at, extent in zip(box.position, box.extents, strict=False))
+        if any(
+            far > edge / 2 + CONTACT_TOLERANCE for far, edge in zip(reach, table.size, strict=True)
+        ):
             raise SceneError(
                 f"{where}: position {list(box.position)} is off the table, "
                 f"expected its footprint within +-{table.size[0] / 2:g}, +-{table.size[1] / 2:g} m"

@@ -16,8 +16,12 @@ FROM (
     UNION ALL SELECT file, row, split, shard FROM plans
     UNION ALL SELECT file, row, split, shard FROM timings
     UNION ALL SELECT file, row, split, shard FROM labels
+    UNION ALL SELECT file, row, split, shard FROM beside_plans
+    UNION ALL SELECT file, row, split, shard FROM beside_labels
+    UNION ALL SELECT file, row, split, shard FROM durations
 )
-WHERE NOT ends_with(
+-- (a merged dataset numbers the shards of its sources, which are elsewhere, anew)
+WHERE NOT regexp_matches(file, '^(\.\./|/|[a-z0-9]+://)') AND NOT ends_with(
     file, 'split=' || split || '/shard-' || lpad(shard::VARCHAR, 6, '0') || '.parquet'
 );
 
@@ -110,13 +114,28 @@ SELECT l.file, l.row, 'relevant',
     l.query || ': expected ' || list_contains(p.moved, l.query)
     || ' as the plan says, found ' || l.relevant
 FROM labels AS l JOIN plans AS p USING (plan_id)
-WHERE l.relevant <> list_contains(p.moved, l.query)
+WHERE l.policy = 'found' AND l.relevant <> list_contains(p.moved, l.query)
 UNION ALL
 SELECT l.file, l.row, 'subject', 'expected goal, scene and flags of the plan, found others'
 FROM labels AS l JOIN plans AS p USING (plan_id)
 WHERE (l.scene_id, l.predicate, l.subject, l.reference, l.ambiguous)
     <> (p.scene_id, p.predicate, p.subject, p.reference, p.ambiguous)
     OR l.is_goal_object <> (l.query IN (p.subject, p.reference));
+
+-- rule: labels beside the current ones are of plans that hold
+SELECT l.file, l.row, 'plan_id' AS "column", 'expected a row in plans, found none' AS message
+FROM beside_labels AS l ANTI JOIN all_plans AS p USING (plan_id)
+UNION ALL
+SELECT l.file, l.row, 'plan_id', 'expected a plan that holds, found one that does not'
+FROM beside_labels AS l JOIN all_plans AS p USING (plan_id) WHERE NOT p.holds
+UNION ALL
+SELECT l.file, l.row, 'relevant', l.query || ': expected relevant as every plan moves it, found false'
+FROM beside_labels AS l JOIN all_plans AS p USING (plan_id)
+WHERE l.policy IN ('found', 'any-minimal') AND NOT l.relevant AND list_contains(p.moved, l.query)
+UNION ALL
+SELECT l.file, l.row, 'relevant', l.query || ': expected irrelevant as the plan does without it, found true'
+FROM beside_labels AS l JOIN all_plans AS p USING (plan_id)
+WHERE l.policy IN ('found', 'necessary') AND l.relevant AND NOT list_contains(p.moved, l.query);
 
 -- rule: a labelled plan has one label for each object
 SELECT l.file, l.row, 'query' AS "column",

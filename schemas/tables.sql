@@ -20,6 +20,22 @@ FROM read_parquet(getvariable('dataset') || '/timings/**/*.parquet', hive_partit
 CREATE OR REPLACE VIEW labels AS
 FROM read_parquet(getvariable('dataset') || '/labels/**/*.parquet', hive_partitioning = true);
 
+CREATE OR REPLACE VIEW durations AS
+FROM read_parquet(getvariable('dataset') || '/durations/**/*.parquet', hive_partitioning = true);
+
+-- What was made by another planner, goal set or label policy; see all_labels, label_changes.
+CREATE OR REPLACE VIEW beside_plans AS
+SELECT * EXCLUDE (planner, config) FROM read_parquet(
+    getvariable('dataset') || '/beside/*/*/plans/**/*.parquet',
+    hive_partitioning = true, hive_types_autocast = false
+);
+
+CREATE OR REPLACE VIEW beside_labels AS
+SELECT * EXCLUDE (planner, config) FROM read_parquet(
+    getvariable('dataset') || '/beside/*/*/labels/**/*.parquet',
+    hive_partitioning = true, hive_types_autocast = false
+);
+
 CREATE OR REPLACE VIEW checkpoints AS
 FROM read_parquet(getvariable('dataset') || '/checkpoints/*.parquet');
 

@@ -1,5 +1,5 @@
--- Views over the tables of a dataset: scenes, plans, timings, labels, checkpoints, predictions,
--- evaluations. Plain DuckDB SQL; `relevance sql` has all of them, and after tables.sql they work
+-- Views over the tables of a dataset: scenes, plans, timings, labels, durations, checkpoints,
+-- predictions, evaluations. Plain DuckDB SQL; `relevance sql` has all of them, and after tables.sql they work
 -- in any DuckDB. Shares are 0..1.
 
 -- One row an object of a scene; place counts from 0 and mask = place + 1.
@@ -15,19 +15,21 @@ FROM (
     FROM scenes
 );
 
--- How the labels of the queries (goal objects left out) are balanced.
+-- How the labels of the queries (goal objects left out) are balanced. Two rows of each plan are
+-- of its goal objects, so that plans are counted without looking at their ids.
 CREATE OR REPLACE VIEW label_balance AS
 SELECT
     predicate, split, policy,
-    count(DISTINCT plan_id) AS plans,
-    count(*) AS queries,
-    count(*) FILTER (relevant) AS relevant,
-    count(*) FILTER (relevant) / count(*) AS relevant_share,
-    count(*) FILTER (ambiguous) / count(*) AS ambiguous_share
+    count(*) FILTER (is_goal_object) // 2 AS plans,
+    count(*) FILTER (NOT is_goal_object) AS queries,
+    count(*) FILTER (relevant AND NOT is_goal_object) AS relevant,
+    count(*) FILTER (relevant AND NOT is_goal_object)
+        / nullif(count(*) FILTER (NOT is_goal_object), 0) AS relevant_share,
+    count(*) FILTER (ambiguous AND NOT is_goal_object)
+        / nullif(count(*) FILTER (NOT is_goal_object), 0) AS ambiguous_share
 FROM labels
-WHERE NOT is_goal_object
-GROUP BY ALL
-ORDER BY ALL;
+GROUP BY predicate, split, policy
+ORDER BY predicate, split, policy;
 
 -- The paper's table of label distribution: per predicate and split, over all plans
 -- (n_actions = 'all') and by length of the plan. predicate = 'same-plane' sums its four
@@ -157,3 +159,14 @@ FROM scenes
 GROUP BY scene_id
 HAVING count(*) > 1
 ORDER BY scene_id;
+
+-- Where the hours went: busy time of one process, s. Stages are scenes and the predicates.
+CREATE OR REPLACE VIEW stage_seconds AS
+SELECT
+    stage, split,
+    count(*) AS shards, sum(rows)::BIGINT AS rows,
+    sum(seconds) AS seconds, sum(seconds_cpu) AS seconds_cpu,
+    sum(rows) / nullif(sum(seconds), 0) AS rows_per_second
+FROM durations
+GROUP BY stage, split
+ORDER BY stage, split;

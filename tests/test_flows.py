@@ -196,7 +196,7 @@ def test_bad_input_is_not_retried(prefect_server: None, tmp_path: Path) -> None:
 # --- the pipeline through the flows --------------------------------------------------------
 
 
-def _bytes(root: Path, but: tuple[str, ...] = ("timings",)) -> dict[str, str]:
+def _bytes(root: Path, but: tuple[str, ...] = ("timings", "durations")) -> dict[str, str]:
     """Hash of every file of a dataset, apart from the tables that hold a clock."""
     return {
         str(file.relative_to(root)): hashlib.sha256(file.read_bytes()).hexdigest()
@@ -244,13 +244,20 @@ def dataset(prefect_server: None, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 def test_flows_make_the_same_bytes_as_the_plain_functions(dataset: Path, tmp_path: Path) -> None:
-    from relevance.generation import DatasetConfig, generate_shard, label_shard, prepare
+    from relevance.generation import (
+        DatasetConfig,
+        finish,
+        generate_shard,
+        label_shard,
+        prepare,
+    )
 
     config = configured(DatasetConfig, "smoke", FEW)
     for spec in reversed(prepare(tmp_path, config)):
         generate_shard(tmp_path, config, spec)
         for predicate in spec.predicates:
             label_shard(tmp_path, config, spec, predicate)
+    finish(tmp_path)
     plain = _bytes(tmp_path)
     assert {name: made for name, made in _bytes(dataset).items() if name in plain} == plain
     assert len(plain) == 1 + 2 * 8 + 2 * (5 * 4 + 3)
@@ -322,6 +329,29 @@ def test_flows_refuse_what_is_not_there(prefect_server: None, tmp_path: Path) ->
         label(dataset=str(tmp_path))
     with pytest.raises(ParameterError, match="unknown 'above', expected on-the-left"):
         label(dataset=str(tmp_path), predicates=["above"])
+
+
+def test_another_policy_is_a_parameter(dataset: Path) -> None:
+    from flows.label import label
+    from relevance.store import Dataset
+
+    before = _bytes(dataset)
+    made = label(dataset=str(dataset), predicates=["on"], policy="any-minimal", max_workers=1)
+    assert (made["shards"], made["written"]) == (3, 3)
+    assert [of.policy for of in Dataset.open(dataset).labellings()] == ["any-minimal"]
+    assert {name: c for name, c in _bytes(dataset).items() if name in before} == before
+    with pytest.raises(ParameterError, match="policy: unknown 'guess', expected found, nec"):
+        label(dataset=str(dataset), policy="guess")
+
+
+def test_a_cluster_is_an_address(prefect_server: None, tmp_path: Path) -> None:
+    from prefect.exceptions import ParameterTypeError
+
+    from flows.generate import generate
+
+    with pytest.raises(ParameterTypeError, match="the address of a Dask scheduler"):
+        generate(dataset=str(tmp_path / "new"), preset="smoke", cluster="somewhere")
+    assert not (tmp_path / "new").exists()
 
 
 def test_retrain_trains_evaluates_and_then_rests(dataset: Path) -> None:
@@ -414,7 +444,7 @@ def _ended(process: subprocess.Popen[bytes]) -> Iterator[subprocess.Popen[bytes]
 
 
 def test_a_killed_flow_leaves_nobody_behind_and_resumes_to_the_same_bytes(tmp_path: Path) -> None:
-    from relevance.generation import DatasetConfig, generate_shard, prepare
+    from relevance.generation import DatasetConfig, finish, generate_shard, prepare
 
     calm, killed = tmp_path / "calm", tmp_path / "killed"
     with _ended(_generate(killed, tmp_path / "home", 2)) as process:
@@ -432,6 +462,7 @@ def test_a_killed_flow_leaves_nobody_behind_and_resumes_to_the_same_bytes(tmp_pa
     config = configured(DatasetConfig, "smoke", MORE)
     for spec in prepare(calm, config):
         generate_shard(calm, config, spec)
+    finish(calm)
     assert _bytes(killed) == _bytes(calm)
     assert len([*calm.glob("scenes/*/*.parquet")]) == 20
     assert {file: file.stat().st_mtime_ns for file in before} == before

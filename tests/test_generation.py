@@ -21,7 +21,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relevance import generation
 from relevance.generation import (
     Counts,
     DatasetConfig,
@@ -30,6 +29,7 @@ from relevance.generation import (
     label_shard,
     load_config,
     prepare,
+    shards,
     work,
 )
 from relevance.labels import stored_scene
@@ -82,7 +82,7 @@ def contents(root: Path) -> dict[str, bytes]:
     return {
         str(file.relative_to(root)): file.read_bytes()
         for file in sorted(root.rglob("*"))
-        if file.is_file() and "timings" not in file.parts
+        if file.is_file() and not {"timings", "durations"} & set(file.parts)
     }
 
 
@@ -239,7 +239,7 @@ def test_images_belong_to_their_rows() -> None:
 
 
 def test_settings_without_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(generation, "ATTEMPTS", 3)
+    monkeypatch.setattr(shards, "ATTEMPTS", 3)
     tight = replace(CONFIG, scene=SceneConfig(min_objects=10, reach=(0.30, 0.34), tries=2))
     spec = prepare(tmp_path, tight)[0]
     with pytest.raises(DatasetError, match=r"scene 0 of train: no draw in 3 was accepted"):
@@ -399,10 +399,10 @@ def test_every_solved_test_plan_is_replayed() -> None:
 
 def test_the_replayed_share_is_a_share() -> None:
     ids = [f"scene{i}" for i in range(4000)]
-    drawn = sum(generation._chosen(name, "on(a, b)", 0.1) for name in ids)
+    drawn = sum(shards._chosen(name, "on(a, b)", 0.1) for name in ids)
     assert 330 < drawn < 470
-    assert not any(generation._chosen(name, "on(a, b)", 0.0) for name in ids)
-    assert all(generation._chosen(name, "on(a, b)", 1.0) for name in ids)
+    assert not any(shards._chosen(name, "on(a, b)", 0.0) for name in ids)
+    assert all(shards._chosen(name, "on(a, b)", 1.0) for name in ids)
 
 
 def test_labels_need_scenes_and_a_fitting_predicate(tmp_path: Path) -> None:

@@ -14,15 +14,19 @@ import numpy as np
 import pybullet
 import pytest
 
-from relevance.sampling import SceneConfig, sample_scene
+from relevance.sampling import Randomisation, SceneConfig, sample_scene
 from relevance.scene import (
     Box,
     Camera,
     Light,
     Scene,
+    Table,
+    Texture,
+    scene_from_json,
     scene_to_json,
 )
 from relevance.simulation import Renderer, Rendering, rejects
+from relevance.simulation.textures import pattern
 
 SCENE = Scene(
     objects=(
@@ -323,3 +327,157 @@ def test_mask_values_follow_the_order_of_objects(renderer):
     swapped = np.array([0, 3, 2, 1])[straight.mask]
     assert (turned.mask == swapped).all()
     assert (turned.image == straight.image).all()
+
+
+# ---------------------------------------------------------------- randomised looks
+
+KINDS = ("checks", "stripes", "noise")
+
+
+@pytest.fixture(scope="module")
+def dressed() -> list[Scene]:
+    scenes = [
+        sample_scene(
+            SceneConfig(family=family, randomisation=Randomisation(texture_share=1.0)),
+            seed=4,
+            index=index,
+        )
+        for family in ("same-plane", "on")
+        for index in range(6)
+    ]
+    return [scene for scene in scenes if scene is not None]
+
+
+def test_a_randomised_scene_renders_again_to_equal_pixels_in_another_process(
+    renderer, dressed, tmp_path
+):
+    assert {s.table.texture.kind for s in dressed if s.table.texture} == set(KINDS)
+    stored = [scene_from_json(scene_to_json(scene)) for scene in dressed]
+    here = [digest(renderer.render(scene)) for scene in dressed]
+    assert [digest(renderer.render(scene)) for scene in reversed(stored)][::-1] == here
+    assert len(set(here)) == len(here)
+    (tmp_path / "scenes.jsonl").write_text("\n".join(map(scene_to_json, dressed)))
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[2])\n"
+        "from test_rendering import Renderer, digest\n"
+        "from relevance.scene import read_scenes\n"
+        "with Renderer() as renderer:\n"
+        "    print(*[digest(renderer.render(s)) for s in read_scenes(sys.argv[1])])"
+    )
+    arguments = [str(tmp_path / "scenes.jsonl"), str(Path(__file__).parent)]
+    run = subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True
+    )
+    assert run.stdout.split() == here
+
+
+def test_light_and_table_change_the_picture_but_not_what_is_seen(renderer, dressed):
+    for scene in dressed:
+        plain = replace(scene, id="", light=Light(), table=Table())
+        before, after = renderer.render(plain), renderer.render(scene)
+        assert (before.mask == after.mask).all()
+        assert (before.visible_pixels == after.visible_pixels).all()
+        assert (before.visible_fraction == after.visible_fraction).all()
+        assert (before.image != after.image).any(axis=-1).mean() > 0.5
+
+
+def test_a_texture_paints_the_table_alone(renderer):
+    texture = Texture(kind="checks", color=(0.2, 0.4, 0.2), scale=0.07, angle=0.4, seed=3)
+    table = Table(texture=texture)
+    plain, textured = renderer.render(SCENE), renderer.render(replace(SCENE, id="", table=table))
+    changed = (plain.image != textured.image).any(axis=-1)
+    assert not changed[plain.mask > 0].any()
+    assert (plain.views == textured.views).all()
+    floor = (plain.image == (176, 180, 188)).all(axis=-1)
+    assert floor.any()
+    assert not changed[floor].any()
+    assert 0.4 < changed[(plain.mask == 0) & ~floor].mean() < 0.6
+
+
+def test_the_two_colours_of_a_texture_are_those_of_plain_tables(renderer):
+    """Lit and shadowed: a checked pixel is what it would be on a table of that one colour."""
+    first, second = (0.9, 0.8, 0.7), (0.2, 0.4, 0.2)
+    texture = Texture(kind="checks", color=second, scale=0.07)
+    scenes = [
+        replace(SCENE, id="", table=table)
+        for table in (Table(color=first), Table(color=second), Table(color=first, texture=texture))
+    ]
+    one, other, both = (renderer.render(scene).image for scene in scenes)
+    is_one, is_other = (both == one).all(axis=-1), (both == other).all(axis=-1)
+    assert (is_one | is_other).all()
+    assert is_one.mean() > 0.3
+    assert is_other.mean() > 0.3
+
+
+def test_a_texture_of_the_table_s_own_colour_is_no_texture(renderer):
+    table = Table()
+    for kind in KINDS:
+        same = Table(texture=Texture(kind=kind, color=table.color, scale=0.05, seed=2))
+        again = renderer.render(replace(SCENE, id="", table=same))
+        assert (again.image == renderer.render(SCENE).image).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_patterns_are_shares_with_the_size_that_was_asked_for(kind):
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 401), np.linspace(-0.6, 0.6, 601))
+
+    def make(**more) -> np.ndarray:
+        return pattern(Texture(**({"kind": kind, "color": (0, 0, 0), "scale": 0.05} | more)), x, y)
+
+    first = make()
+    assert first.min() >= 0
+    assert first.max() <= 1
+    assert 0.3 < first.mean() < 0.7
+    assert first.std() > 0.08
+    assert (make() == first).all()
+    assert (make(seed=1) != first).mean() > 0.2
+    assert (make(angle=0.5) != first).mean() > 0.2
+
+    def roughness(values: np.ndarray) -> float:
+        return float(
+            np.abs(np.diff(values, axis=0)).mean() + np.abs(np.diff(values, axis=1)).mean()
+        )
+
+    assert roughness(make(scale=0.02)) > 1.8 * roughness(first)
+
+
+def test_patterns_are_the_same_on_every_machine():
+    x, y = np.array([-0.31, 0.02, 0.17, 0.33]), np.array([0.5, -0.24, 0.01, 0.42])
+    texture = Texture(kind="noise", color=(0, 0, 0), scale=0.05, angle=0.25, seed=12345)
+    assert pattern(texture, x, y) == pytest.approx(
+        [0.535033906635, 0.343456982826, 0.701544156415, 0.385242574110], abs=1e-9
+    )
+
+
+def test_the_draw_itself_keeps_boxes_in_sight(renderer):
+    """Hardly any scene is thrown away for hiding a box; without the check many are."""
+
+    def hidden(least: float) -> int:
+        scenes = [
+            sample_scene(SceneConfig(family="on", visible=least), seed=3, index=i)
+            for i in range(30)
+        ]
+        return sum(rejects(renderer.render(scene)) is not None for scene in scenes if scene)
+
+    assert hidden(SceneConfig().visible) <= 1
+    assert hidden(0.0) >= 4
+
+
+def test_importing_the_simulation_says_nothing():
+    """pybullet alone prints its build time; errors must still come through."""
+    program = (
+        "import sys, relevance.simulation; print('done');"
+        "print('heard', file=sys.stderr, flush=True)"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert (run.stdout, run.stderr) == ("done\n", "heard\n")
+    closed = subprocess.run(
+        f'"{sys.executable}" -c "import relevance.simulation; print(1)" 2>&-',
+        shell=True,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert closed.stdout == "1\n"

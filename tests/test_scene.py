@@ -20,6 +20,8 @@ from relevance.scene import (
     Predicate,
     Scene,
     SceneError,
+    Table,
+    Texture,
     content_hash,
     footprint_gap,
     goal_holds,
@@ -411,3 +413,47 @@ def test_python_construction_is_checked_too():
         Scene(objects=(box("red"), box("blue", 0.01)))
     with pytest.raises(ValueError, match="finite"):
         box("red", math.nan)
+
+
+# ---------------------------------------------------------------- textures
+
+
+def textured(**more) -> Scene:
+    texture = Texture(**({"kind": "checks", "color": (0.2, 0.3, 0.4), "scale": 0.05} | more))
+    box = Box(name="red", size=(0.06, 0.05, 0.08), position=(0.02, 0.11, 0.04), color=(1, 0, 0))
+    return Scene(objects=(box,), table=Table(texture=texture))
+
+
+def test_a_plain_table_hashes_as_before_there_were_textures():
+    """Stored scenes keep their ids."""
+    box = Box(
+        name="red",
+        size=(0.06, 0.05, 0.08),
+        position=(0.02, 0.11, 0.04),
+        yaw=0.3,
+        color=(0.8, 0.1, 0.1),
+    )
+    assert Scene(objects=(box,)).id == "0bd464dbcaff7bf5"
+
+
+def test_every_parameter_of_a_texture_is_in_the_id_and_survives_json():
+    scenes = [
+        textured(),
+        textured(kind="stripes"),
+        textured(color=(0.2, 0.3, 0.5)),
+        textured(scale=0.06),
+        textured(angle=0.1),
+        textured(seed=1),
+    ]
+    assert len({scene.id for scene in scenes}) == len(scenes)
+    for scene in scenes:
+        assert scene_from_json(scene_to_json(scene)) == scene
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("kind", "fur"), ("scale", 0), ("seed", -1), ("color", (2, 0, 0)), ("angle", math.nan)],
+)
+def test_impossible_textures_are_refused(field, value):
+    with pytest.raises(ValueError, match=field):
+        textured(**{field: value})

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import pyarrow.parquet as pq
 import pytest
 from test_generation import CONFIG, small_dataset
 
 from relevance.generation import prepare
 from relevance.scene import Predicate, scene_to_json
-from relevance.statistics import Breach, card, check, rules, statistics
+from relevance.statistics import Breach, check, rules, statistics, write_card
 from relevance.store import Dataset, DatasetError, sql
 
 SCENES = {"split": "train", "shard": 0}
@@ -396,7 +398,7 @@ def test_label_distribution_is_a_recount() -> None:
     assert sum(queries.values()) > 50
 
 
-def test_statistics_and_card() -> None:
+def test_statistics_are_what_a_recount_gives() -> None:
     dataset = Dataset.open(small_dataset())
     counted = statistics(small_dataset())
     plans = dataset.read_rows("plans")
@@ -414,9 +416,60 @@ def test_statistics_and_card() -> None:
     for row in replayed:
         values = dict(zip(verdicts.columns, row, strict=True))
         assert values["replayed"] == values["solved"]
-    text = card(counted)
+    blockers = counted["plan_blockers"]
+    moved = Counter(
+        (
+            plan["predicate"],
+            plan["split"],
+            len(set(plan["moved"]) - {plan["subject"], plan["reference"]}),
+        )
+        for plan in plans
+        if plan["holds"]
+    )
+    assert {tuple(row[:3]): row[3] for row in blockers.rows} == moved
+    ambiguity = counted["plan_ambiguity"]
+    assert sum(row[ambiguity.columns.index("ambiguous")] for row in ambiguity.rows) == sum(
+        plan["ambiguous"] and plan["holds"] for plan in plans
+    )
+    sizes = counted["by_size"]
+    assert sum(row[sizes.columns.index("goals")] for row in sizes.rows) == len(plans)
+    tenths = counted["visibility_tenths"]
+    objects = sum(len(row["objects"]) for row in dataset.read_rows("scenes"))
+    assert sum(row[tenths.columns.index("objects")] for row in tenths.rows) == objects
+    origins = {row[0]: row[-1] for row in counted["origins"].rows}
+    assert origins == {"scenes": 8, "plans": len(plans), "labels": len(labels)}
+
+
+def test_the_card_is_one_folder_that_needs_nothing_else(tmp_path: Path) -> None:
+    page = write_card(small_dataset(), tmp_path / "card")
+    text = page.read_text()
+    dataset = Dataset.open(small_dataset())
+    plans = dataset.read_rows("plans")
     assert f"8 scenes, {len(plans)} goals" in text
     assert "| predicate | split | n_actions |" in text
+    assert dataset.content_hash() in text
+    assert dataset.description["hashes"]["scenes"] in text
+    assert '"crowding"' in text
+    pictures = re.findall(r"!\[.+\]\((.+\.png)\)", text)
+    assert {"balance.png", "lengths.png", "sizes.png", "examples.png"} <= set(pictures)
+    assert {file.name for file in page.parent.iterdir()} == {"README.md", *pictures}
+    for name in pictures:
+        picture = cv2.imread(str(page.parent / name))
+        assert picture is not None
+        assert picture.shape[1] > 600
+        assert picture.std() > 5
+    assert str(tmp_path) not in text
+    again = write_card(small_dataset(), tmp_path / "again")
+    assert again.read_text() == text
+    for name in pictures:
+        assert (again.parent / name).read_bytes() == (page.parent / name).read_bytes()
+
+
+def test_a_dataset_without_plans_has_a_card(tmp_path: Path) -> None:
+    prepare(tmp_path / "empty", CONFIG)
+    text = write_card(tmp_path / "empty", tmp_path / "card").read_text()
+    assert "0 scenes, 0 goals" in text
+    assert "None." in text
 
 
 def test_failures_are_counted_by_reason(dataset: Dataset) -> None:

@@ -180,7 +180,7 @@ def test_scene_schema_equals_the_domain_types() -> None:
 def test_type_names_survive_duckdb(table: str) -> None:
     for column in table_schema(table).columns:
         found = type_name(table_schema(table).arrow.field(column.name).type)
-        assert found == column.type.replace('"on"', "on")
+        assert found == column.type.replace('"', "")
 
 
 def test_unknown_table() -> None:
@@ -380,7 +380,7 @@ def broken_parquet(path: Path, how: str) -> None:
         ("column", r"column seed: expected BIGINT, found no such column"),
         ("type", r"column seed: expected BIGINT, found VARCHAR"),
         ("extra", r"column note: expected no such column, found VARCHAR"),
-        ("version", r"version of the schema: expected 1, found 99"),
+        ("version", r"version of the schema: expected \d+, found 99"),
         ("foreign", r"table of the schema: expected scenes, found none"),
         ("same", r"content hash: expected [0-9a-f]{16}, found [0-9a-f]{16}"),
     ],
@@ -523,12 +523,12 @@ def test_plain_duckdb_gives_the_same(dataset: Dataset, tmp_path: Path) -> None:
             name = re.search(r"VIEW (\w+)", statement.query)
             assert name is not None
             made.add(name[1])
-            if copy.files(name[1]):
+            if name[1] in TABLES and copy.files(name[1]):
                 plain.execute(statement)
             else:
                 with pytest.raises(duckdb.IOException, match="No files found"):
                     plain.execute(statement)
-        assert made == set(TABLES)
+        assert made == {*TABLES, "beside_plans", "beside_labels"}
         views = (SCHEMAS / "views.sql").read_text()
         for name in ("objects", "label_balance", "visibility", "scene_sizes", "split_overlap"):
             query = re.search(rf"CREATE OR REPLACE VIEW {name} .*?;\n", views, re.DOTALL)

@@ -24,6 +24,7 @@ ORDER = (
     "training",
     "evaluation",
     "report",
+    "benchmarks",
     "cli",
 )
 """The stages; each may import those before it."""
@@ -37,10 +38,14 @@ DOORS = {
     "pyarrow": ("store",),
     "duckdb": ("store",),
     "webdataset": ("store",),
+    "upath": ("store",),
+    "fsspec": ("store",),
     "torch": ("models", "examples", "training", "evaluation"),
-    "matplotlib": ("statistics", "report"),
+    "matplotlib": ("statistics", "report", "benchmarks"),
+    "robotic": ("planner",),
     "jinja2": ("report",),
     "prefect": ("flows",),
+    "prefect_dask": ("flows",),
     "streamlit": ("dashboards",),
     "tyro": ("cli",),
     "rich": ("cli",),

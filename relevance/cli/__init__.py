@@ -11,12 +11,12 @@ import functools
 import itertools
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import get_args
 
 import tyro
 
-from relevance.cli.commands import COMMANDS, Preset
+from relevance.cli.commands import COMMANDS, Command, Preset
 from relevance.cli.terminal import UsageError, say
 
 
@@ -44,11 +44,11 @@ def _preset(arguments: Sequence[str], default: Preset) -> Preset:
     return default
 
 
-def _help() -> str:
-    width = max(map(len, COMMANDS))
+def _help(commands: Mapping[str, Command] = COMMANDS) -> str:
+    width = max(map(len, commands))
     lines = ["usage: relevance COMMAND [options]; `relevance COMMAND --help` shows the options", ""]
-    lines += [f"  {name:<{width}}  {command.about}" for name, command in COMMANDS.items()]
-    lines += ["", "examples:", *(f"  {c.examples[0]}" for c in COMMANDS.values())]
+    lines += [f"  {name:<{width}}  {command.about}" for name, command in commands.items()]
+    lines += ["", "examples:", *(f"  {c.examples[0]}" for c in commands.values())]
     return "\n".join(lines)
 
 
@@ -63,9 +63,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         print(f"relevance {version('relevance')}")
         return 0
+    targets = {full: c for full, c in COMMANDS.items() if full.startswith(f"{name} ")}
+    if targets and (not rest or rest[0] in ("-h", "--help")):  # `relevance bench`
+        print(_help(targets))
+        return 0
     try:
+        if targets:  # `relevance bench planner`: two words name one command
+            name, *rest = f"{name} {rest[0]}", *rest[1:]
         if name not in COMMANDS:
-            raise UsageError(f"unknown command {name!r}, expected one of {', '.join(COMMANDS)}")
+            known = ", ".join(targets or COMMANDS)
+            raise UsageError(f"unknown command {name!r}, expected one of {known}")
         command = COMMANDS[name]
         run = command.make(_preset(rest, command.preset))
         about = "\n".join([(run.__doc__ or "").partition("Args:")[0].strip(), "", "examples:"])

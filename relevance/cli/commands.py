@@ -5,6 +5,7 @@ A maker imports only what its own flags need; the function imports the rest when
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import dataclasses
+import functools
 import os
 import subprocess
 import sys
@@ -14,19 +15,24 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from relevance.cli import datasets
+from relevance.cli.bench import bench_planner
 from relevance.cli.processes import in_processes
 from relevance.cli.terminal import Format, UsageError, bar, bars, console, say, show, to_json
 
 Preset = Literal["smoke", "demo", "laptop", "paper"]
 DatasetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATASET")]
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+OptionalName = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
+OptionalCount = Annotated[int | None, tyro.conf.arg(metavar="N")]
 Workers = Annotated[int, tyro.conf.arg(metavar="N")]
 
 CORES = len(os.sched_getaffinity(0))
 
 
 def _generate(preset: Preset) -> Callable[..., int]:
-    from relevance.generation import DatasetConfig, generate_shard, prepare
+    from relevance.generation import DatasetConfig, finish, generate_shard, generated, prepare
+    from relevance.store import Dataset
 
     start: DatasetConfig = getattr(DatasetConfig, preset)()
 
@@ -43,43 +49,67 @@ def _generate(preset: Preset) -> Callable[..., int]:
             preset: Where the other settings start from.
             workers: Processes that work at a time.
         """
-        specs = prepare(dataset, config)
-        jobs = [(generate_shard, (dataset, config, spec)) for spec in specs]
-        reports = in_processes("scenes", jobs, [spec.count for spec in specs], workers)
-        made = sum(not report.skipped for report in reports)
-        say(f"{dataset}: {made} shards made, {len(reports) - made} were there")
+        specs = prepare(dataset, config, scenes_only=True)
+        there = Dataset.open(dataset)
+        missing = [spec for spec in specs if not generated(there, spec)]
+        jobs = [(generate_shard, (dataset, config, spec)) for spec in missing]
+        in_processes("scenes", jobs, [spec.count for spec in missing], workers)
+        finish(dataset)
+        say(f"{dataset}: {len(missing)} shards made, {len(specs) - len(missing)} were there")
         return 0
 
     return generate
 
 
 def _label(_: Preset) -> Callable[..., int]:
-    from relevance.generation import label_shard, load_config, prepare
+    from relevance.generation import finish, label_shard, labelled, load_config, prepare
+    from relevance.labels import POLICIES
     from relevance.scene import Predicate
-    from relevance.store import Dataset
+    from relevance.store import Dataset, sql
 
     def label(
         dataset: DatasetArg,
         predicates: tuple[Predicate, ...] = tuple(Predicate),
+        policy: OptionalName = None,
+        replan: bool = False,
+        goals_per_scene: OptionalCount = None,
+        goals_seed: OptionalCount = None,
         workers: Workers = CORES,
     ) -> int:
         """Plan the goals of a dataset's scenes and label what each plan moves.
 
+        Finished shards are skipped. Other labels never replace those that are there: another
+        policy's lie beside them, and after --replan the old plans and labels do.
+
         Args:
             dataset: Folder of the dataset.
             predicates: Which predicates to plan.
+            policy: found, necessary or any-minimal; the dataset's own when not given.
+            replan: Plan anew with the planner of today, if that is another one.
+            goals_per_scene: Plan another number of goals a scene (and replan).
+            goals_seed: Plan another draw of goals (and replan).
             workers: Processes that work at a time.
         """
-        config = load_config(Dataset.open(dataset))
+        if policy is not None and policy not in POLICIES:
+            raise UsageError(f"--policy {policy}: expected one of {', '.join(POLICIES)}")
+        there = Dataset.open(dataset)
+        config = load_config(there)
+        goals = {"goals_per_scene": goals_per_scene, "goals_seed": goals_seed}
+        goals = {name: value for name, value in goals.items() if value is not None}
+        config = dataclasses.replace(config, **goals)
         pairs = [
             (spec, predicate)
-            for spec in prepare(dataset, config)
+            for spec in prepare(dataset, config, replan=replan or bool(goals))
             for predicate in spec.predicates
             if predicate in predicates
         ]
-        jobs = [(label_shard, (dataset, config, spec, predicate)) for spec, predicate in pairs]
-        reports = in_processes("scenes", jobs, [spec.count for spec, _ in pairs], workers)
-        tasks, holds = sum(r.rows for r in reports), sum(r.holds for r in reports)
+        missing = [pair for pair in pairs if not labelled(there, config, *pair, policy)]
+        stage = functools.partial(label_shard, policy=policy)
+        jobs = [(stage, (dataset, config, spec, predicate)) for spec, predicate in missing]
+        in_processes("scenes", jobs, [spec.count for spec, _ in missing], workers)
+        finish(dataset)
+        _, [(tasks, holds)] = sql(dataset, "select count(*), count_if(holds) from plans")
+        say(f"{dataset}: {len(missing)} shards made, {len(pairs) - len(missing)} were there")
         say(f"{dataset}: {tasks} goals, {holds} have a plan that holds")
         return 0
 
@@ -173,12 +203,14 @@ def _plan(_: Preset) -> Callable[..., int]:
         scenes: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENES")],
         goal: Annotated[tuple[str, ...], tyro.conf.arg(metavar="GOAL")] = (),
         json: tyro.conf.FlagCreatePairsOff[bool] = False,
+        planner: Literal["ours", "rai"] = "ours",
         search: Literal["tree", "informed"] = "informed",
         guide: Mode = "none",
         checkpoint: OptionalPath = None,
         beta: float = 0.0,
         limit: int = default.node_limit,
         max_actions: int = default.max_actions,
+        seconds: float = 30.0,
     ) -> int:
         """Plan the goals of your own scenes; every plan is replayed in the simulator.
 
@@ -186,12 +218,15 @@ def _plan(_: Preset) -> Callable[..., int]:
             scenes: JSON file, or JSON lines with one scene a line.
             goal: Further goals for every scene, e.g. 'on-the-left(red, blue)'.
             json: One JSON line a goal instead of text.
+            planner: Our planner, or rai's own LGP solver (pip install 'relevance[rai]').
             search: The paper's breadth-first tree, or our informed search.
             guide: How the scores of the checkpoint enter the search.
             checkpoint: The model that scores the objects; a guide needs one.
             beta: An object is kept when its score exceeds -beta.
             limit: Most nodes that the search may open for a goal.
             max_actions: Most picks and places in a plan.
+            seconds: CPU seconds that rai has for a goal (--search, --limit and --max-actions
+                are settings of our planner).
         """
         from relevance.simulation import replay
 
@@ -209,7 +244,14 @@ def _plan(_: Preset) -> Callable[..., int]:
         ]
         if not tasks:
             raise SceneError(f"{scenes}: no goals, expected some in the file or by --goal")
-        from relevance.planner import plan
+        if planner == "rai":
+            from relevance.planner.peer import RaiConfig, plan_rai
+
+            solve = functools.partial(plan_rai, config=RaiConfig(seconds=seconds))
+        else:
+            from relevance.planner import plan
+
+            solve = functools.partial(plan, config=config)
 
         guidance = None
         if checkpoint:
@@ -218,7 +260,7 @@ def _plan(_: Preset) -> Callable[..., int]:
             guidance = load_guide(checkpoint, mode=guide, beta=beta)
         with bar("goals", quiet=not json and sys.stdout.isatty()) as progress:
             for done, (scene, wanted) in enumerate(tasks, 1):
-                result = plan(scene, wanted, config=config, guide=guidance)
+                result = solve(scene, wanted, guide=guidance)
                 solved = result.status == "solved"
                 verdict = replay(scene, wanted, result.phases) if solved else None
                 line = _plan_line(scene.id, result, verdict)
@@ -256,6 +298,7 @@ def _sql(_: Preset) -> Callable[..., int]:
         dataset: DatasetArg,
         query: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="QUERY")],
         format: Format = "table",
+        policy: OptionalName = None,
     ) -> int:
         """Ask DuckDB about a dataset; there is a view for each table.
 
@@ -263,30 +306,37 @@ def _sql(_: Preset) -> Callable[..., int]:
             dataset: Folder of the dataset.
             query: SQL over scenes, objects, plans, labels, predictions, evaluations, checkpoints.
             format: How to print the rows.
+            policy: The label policy that `labels` shows; the dataset's own when not given.
         """
         from relevance.store import sql
 
-        show(*sql(dataset, query), format)
+        show(*sql(dataset, query, policy=policy), format)
         return 0
 
     return sql
 
 
 def _stats(_: Preset) -> Callable[..., int]:
-    def stats(dataset: DatasetArg, format: Literal["table", "json", "card"] = "table") -> int:
-        """Count a dataset: label balance, plan lengths, failures by reason, visibility.
+    def stats(
+        dataset: DatasetArg,
+        format: Literal["table", "json"] = "table",
+        card: Path | None = None,
+    ) -> int:
+        """Count a dataset: label balance, plan lengths, failures by reason, visibility, time.
 
         Args:
             dataset: Folder of the dataset.
-            format: Tables, JSON, or a dataset card in Markdown.
+            format: How to print the tables.
+            card: Folder to write a dataset card to instead: a page of Markdown and its pictures.
         """
-        from relevance.statistics import card, statistics
+        from relevance.statistics import statistics, write_card
 
+        if card is not None:
+            print(write_card(dataset, card))
+            return 0
         found = statistics(dataset)
         if format == "json":
             print(to_json(dataclasses.asdict(found)))
-        elif format == "card":
-            print(card(found), end="")
         else:
             for table in found.tables:
                 show(table.columns, table.rows, "table", title=table.title)
@@ -421,7 +471,11 @@ COMMANDS = {
     "label": Command(
         make=_label,
         about="plans and labels for a dataset's scenes",
-        examples=("relevance label data/tables", "relevance label data/tables --predicates on"),
+        examples=(
+            "relevance label data/tables",
+            "relevance label data/tables --predicates on",
+            "relevance label data/tables --policy necessary",
+        ),
     ),
     "train": Command(
         make=_train,
@@ -448,6 +502,7 @@ COMMANDS = {
             "relevance plan scenes.jsonl --json",
             "relevance plan scene.json --goal 'on(red, blue)' --search tree",
             "relevance plan scenes.jsonl --guide prune-then-full --checkpoint model.pt",
+            "relevance plan scenes.jsonl --planner rai --seconds 10",
         ),
     ),
     "check": Command(
@@ -461,12 +516,14 @@ COMMANDS = {
         examples=(
             'relevance sql data/tables "select relevant, count(*) from labels group by 1"',
             'relevance sql data/tables "from plans" --format csv > plans.csv',
+            'relevance sql data/tables "select why, count(*) from label_changes group by all"',
         ),
     ),
+    **{name: Command(make=make, **more) for name, (make, more) in datasets.COMMANDS.items()},
     "stats": Command(
         make=_stats,
         about="label balance, plan lengths, visibility",
-        examples=("relevance stats data/tables", "relevance stats data/tables --format card"),
+        examples=("relevance stats data/tables", "relevance stats data/tables --card out/card"),
     ),
     "demo": Command(
         make=_demo,
@@ -477,5 +534,14 @@ COMMANDS = {
         make=_dashboard,
         about="look around in a browser",
         examples=("relevance dashboard data/demo",),
+    ),
+    "bench planner": Command(
+        make=bench_planner,
+        about="the planner's speed, truth, stability and completeness",
+        examples=(
+            "relevance bench planner --tasks 1000",
+            "relevance bench planner --tasks 200 --seed 7 --parts speed truth",
+            "relevance bench planner --tasks 60 --against rai",
+        ),
     ),
 }

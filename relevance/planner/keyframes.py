@@ -107,8 +107,12 @@ def _push(H, g, index, row, count, value, multiplier, mu, equality):
 
 
 @njit(cache=True)
-def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, update, H, g):
-    """Merit, violation; g, H (lower triangle) of the model; with `update`, new multipliers."""
+def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g):
+    """Merit, violation; fills g and H (lower triangle) of the Gauss-Newton model.
+
+    With a gain above 0, the multipliers (eq, ineq, limit, edge) are first moved along the
+    violations.
+    """
     n, m = len(x), len(switches.place_z)
     first = 2 * m * ARM
     obstacles, region = switches.obstacles, switches.region
@@ -157,8 +161,7 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, update, H,
                     row[count] = arm.grasp_y[48 + r * 4 + (3 if i == 2 else i)]
                     count += 1
             value = arm.grasp_y[r]
-            if update:
-                eq[k, r] += mu * value
+            eq[k, r] += gain * value
             got, violated = _push(H, g, index, row, count, value, eq[k, r], mu, True)
             merit += got
             worst = max(worst, violated)
@@ -166,8 +169,7 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, update, H,
             for side in range(2):
                 value = arm.lower[i] - q[i] if side == 0 else q[i] - arm.upper[i]
                 index[0], row[0] = k * ARM + i, (-1.0 if side == 0 else 1.0)
-                if update:
-                    limit[k, i, side] = max(0.0, limit[k, i, side] + mu * value)
+                limit[k, i, side] = max(0.0, limit[k, i, side] + gain * value)
                 got, violated = _push(H, g, index, row, 1, value, limit[k, i, side], mu, False)
                 merit += got
                 worst = max(worst, violated)
@@ -191,8 +193,7 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, update, H,
                     continue
                 d = separation(p, R, switches.half[k, b], o, normal, contact)
                 value = CLEARANCE - d
-                if update:
-                    ineq[k, b, w] = max(0.0, ineq[k, b, w] + mu * value)
+                ineq[k, b, w] = max(0.0, ineq[k, b, w] + gain * value)
                 if value + ineq[k, b, w] / mu <= 0:
                     continue
                 point_gradient(frame, contact, normal, part)
@@ -229,8 +230,7 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, update, H,
                 bound = switches.table[j, 0 if side < 6 else 1]
                 value = row[0] * x[at] + row[1] * x[at + 1] - bound
             index[0], index[1] = at, at + 1
-            if update:
-                edge[j, side] = max(0.0, edge[j, side] + mu * value)
+            edge[j, side] = max(0.0, edge[j, side] + gain * value)
             got, violated = _push(H, g, index, row, 2, value, edge[j, side], mu, False)
             merit += got
             worst = max(worst, violated)
@@ -249,26 +249,27 @@ def solve(x, arm, switches, p0, weight):
     H, g = np.zeros((n, n)), np.zeros(n)
     eq, limit, edge = np.zeros((2 * m, 6)), np.zeros((2 * m, ARM, 2)), np.zeros((m, 8))
     ineq = np.zeros((2 * m, switches.link.shape[1], len(switches.obstacles)))
-    old, slope_g = x.copy(), np.zeros(n)
-    mu, worst, before = 1000.0, 1e9, 1e9
+    old, step = x.copy(), np.zeros(n)
+    mu, gain, worst, before = 1000.0, 0.0, 1e9, 1e9
     for outer in range(_OUTER):
-        merit, worst = assemble(
-            x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, False, H, g
-        )
+        merit, worst = assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g)
         for _ in range(_INNER):
-            step = -g
-            slope_g[:] = g
+            for i in range(n):
+                step[i] = -g[i]
             if not dense_solve(H, step):
                 return 1e9
-            longest = np.max(np.abs(step))
+            longest, slope = 0.0, 0.0
+            for i in range(n):
+                longest = max(longest, abs(step[i]))
+                slope += step[i] * g[i]
             scale = min(1.0, 0.5 / max(longest, 1e-12))
-            slope = np.dot(step, slope_g)
             old[:] = x
             new = merit
             for _ in range(8):
-                x[:] = old + scale * step
+                for i in range(n):
+                    x[i] = old[i] + scale * step[i]
                 new, worst = assemble(
-                    x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, False, H, g
+                    x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, 0.0, H, g
                 )
                 if new <= merit + 1e-4 * scale * slope + 1e-12:
                     break
@@ -281,6 +282,5 @@ def solve(x, arm, switches, p0, weight):
         if outer >= 3 and worst > 0.7 * before:
             return worst  # stuck
         before = worst
-        assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, True, H, g)
-        mu = min(mu * 5.0, 1e5)
+        mu, gain = min(mu * 5.0, 1e5), mu
     return worst

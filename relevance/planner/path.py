@@ -73,7 +73,9 @@ def reach_to(arm, q, target):
                     A[i, j] += ji * arm.grasp_y[6 + r * ARM + j]
         if not dense_solve(A, b):
             return False
-        longest = np.max(np.abs(b))
+        longest = 0.0
+        for i in range(ARM):
+            longest = max(longest, abs(b[i]))
         for i in range(ARM):
             q[i] += b[i] * min(1.0, 0.4 / max(longest, 1e-12))
     return worst < 1e-6
@@ -114,10 +116,11 @@ def smoothness(T):
 @njit(cache=True)
 def assemble(
     X, arm, bodies, obstacles, margin, samples, n_samples, targets, smooth, eq, ineq, limit, mu,
-    update, band, g,
+    gain, band, g,
 ):  # fmt: skip
-    """Merit and Gauss-Newton model of the rows 1..T-1; with `update`, new multipliers.
+    """Merit and Gauss-Newton model of the rows 1..T-1.
 
+    With a gain above 0, the multipliers (eq, ineq, limit) are first moved along the violations.
     Returns (merit, violation) and fills band (n, 3 * ARM) as `banded_solve` wants it, g (n,).
     """
     T = len(X) - 1
@@ -139,8 +142,7 @@ def assemble(
         for i in range(ARM):
             for side in range(2):
                 value = arm.lower[i] - X[t, i] if side == 0 else X[t, i] - arm.upper[i]
-                if update:
-                    limit[t, i, side] = max(0.0, limit[t, i, side] + mu * value)
+                limit[t, i, side] = max(0.0, limit[t, i, side] + gain * value)
                 shifted = value + limit[t, i, side] / mu
                 worst = max(worst, value)
                 if shifted > 0:
@@ -151,8 +153,7 @@ def assemble(
             look_at_grasp(arm, X[t], targets[t])
             for r in range(6):
                 value = arm.grasp_y[r]
-                if update:
-                    eq[t, r] += mu * value
+                eq[t, r] += gain * value
                 shifted = value + eq[t, r] / mu
                 worst = max(worst, abs(value))
                 merit += 0.5 * mu * shifted * shifted
@@ -180,8 +181,7 @@ def assemble(
                 value = margin[b, w] - separation(
                     p, R, bodies.half[b], obstacles[w], normal, contact
                 )
-                if update:
-                    ineq[n, b, w] = max(0.0, ineq[n, b, w] + mu * value)
+                ineq[n, b, w] = max(0.0, ineq[n, b, w] + gain * value)
                 worst = max(worst, value)
                 shifted = value + ineq[n, b, w] / mu
                 if shifted <= 0:
@@ -216,28 +216,32 @@ def solve(X, arm, bodies, obstacles, margin, samples, n_samples, targets):
     smooth, band, g = smoothness(T), np.zeros((n, _WIDTH)), np.zeros(n)
     eq, limit = np.zeros((T + 1, 6)), np.zeros((T + 1, ARM, 2))
     ineq = np.zeros((len(samples), len(bodies.link), len(obstacles)))
-    old, slope_g = X.copy(), np.zeros(n)
-    mu, worst = 500.0, 1e9
+    old, step = X.copy(), np.zeros(n)
+    mu, gain, worst = 500.0, 0.0, 1e9
     for outer in range(8):
         merit, worst = assemble(
             X, arm, bodies, obstacles, margin, samples, n_samples, targets, smooth, eq, ineq, limit,
-            mu, False, band, g,
+            mu, gain, band, g,
         )  # fmt: skip
         for _ in range(12):
-            step = -g
-            slope_g[:] = g
+            for i in range(n):
+                step[i] = -g[i]
             if not banded_solve(band, step):
                 return 1e9
-            longest = np.max(np.abs(step))
+            longest, slope = 0.0, 0.0
+            for i in range(n):
+                longest = max(longest, abs(step[i]))
+                slope += step[i] * g[i]
             scale = min(1.0, 0.5 / max(longest, 1e-12))
-            slope = np.dot(step, slope_g)
             old[:] = X
             new = merit
             for _ in range(6):
-                X[1:T] = old[1:T] + scale * step.reshape(T - 1, ARM)
+                for t in range(1, T):
+                    for i in range(ARM):
+                        X[t, i] = old[t, i] + scale * step[(t - 1) * ARM + i]
                 new, worst = assemble(
                     X, arm, bodies, obstacles, margin, samples, n_samples, targets, smooth, eq,
-                    ineq, limit, mu, False, band, g,
+                    ineq, limit, mu, 0.0, band, g,
                 )  # fmt: skip
                 if new <= merit + 1e-4 * scale * slope + 1e-12:
                     break
@@ -247,11 +251,7 @@ def solve(X, arm, bodies, obstacles, margin, samples, n_samples, targets):
                 break
         if worst < TOLERANCE and outer > 0:
             return worst
-        assemble(
-            X, arm, bodies, obstacles, margin, samples, n_samples, targets, smooth, eq, ineq, limit,
-            mu, True, band, g,
-        )  # fmt: skip
-        mu = min(mu * 4.0, 1e5)
+        mu, gain = min(mu * 4.0, 1e5), mu
     return worst
 
 
@@ -290,14 +290,17 @@ def _clear(arm, q0, q1, bodies, obstacles):
 
     The motion is bounded to first order, with a quarter to spare for the rest.
     """
-    q = 0.5 * (q0 + q1)
+    q = np.zeros(ARM)
+    for i in range(ARM):
+        q[i] = 0.5 * (q0[i] + q1[i])
     p, R, normal, contact = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     look_at_frames(arm, q)
     for b in range(len(bodies.link)):
         at = bodies.link[b] * FRAME
         frame = arm.frames_y[at : at + FRAME]
         body_pose(frame, bodies.centre[b], p, R)
-        arm_length = math.sqrt(np.sum(bodies.centre[b] ** 2)) + bodies.radius[b]
+        x, y, z = bodies.centre[b, 0], bodies.centre[b, 1], bodies.centre[b, 2]
+        arm_length = math.sqrt(x * x + y * y + z * z) + bodies.radius[b]
         shift, turn = 0.0, 0.0
         for axis in range(3):
             v, w = 0.0, 0.0
@@ -325,9 +328,12 @@ def motion(X, arm, leave, leaving, arrive, bodies, obstacles):
     first, last = np.zeros(shape), np.zeros(shape)
     distances(arm, X[0], bodies, obstacles, first)
     distances(arm, X[ROWS], bodies, obstacles, last)
-    margin = np.minimum(CLEARANCE, np.minimum(first, last)) - 1e-4
-    if margin.min() < -ALLOWED:
-        return -1.0
+    margin = first
+    for b in range(len(first)):
+        for w in range(len(obstacles)):
+            margin[b, w] = min(CLEARANCE, first[b, w], last[b, w]) - 1e-4
+            if margin[b, w] < -ALLOWED:
+                return -1.0
     targets = np.zeros((ROWS + 1, 5))
     if not _guess(X, arm, leave, leaving, arrive, bodies, obstacles, targets):
         return -1.0
@@ -344,7 +350,10 @@ def motion(X, arm, leave, leaving, arrive, bodies, obstacles):
         if solve(X, arm, bodies, obstacles, margin, samples, n, targets) > 1.5e-3:
             return -1.0
         depth = dense_check(X, arm, bodies, obstacles, margin, broken)
-        if depth <= 0.5 * ALLOWED and np.max(broken[:, 1]) < 1.2e-3:
+        most = 0.0
+        for t in range(ROWS):
+            most = max(most, broken[t, 1])
+        if depth <= 0.5 * ALLOWED and most < 1.2e-3:
             return depth
         for t in range(ROWS):
             if broken[t, 1] > TOLERANCE and n < len(samples) and 0 < broken[t, 0] < 1:
@@ -360,15 +369,17 @@ def _guess(X, arm, leave, leaving, arrive, bodies, obstacles, targets):
     for b in range(len(bodies.link)):
         if bodies.link[b] == HAND:
             lowest = max(lowest, bodies.centre[b, 2] + bodies.half[b, 2])
-    safe = np.max(obstacles[:, 2] + obstacles[:, 6]) + lowest + 0.02
-    start, end = 0, ROWS - VERTICAL
+    tallest = 0.0
+    for w in range(len(obstacles)):
+        tallest = max(tallest, obstacles[w, 2] + obstacles[w, 6])
+    safe = tallest + lowest + 0.02
+    start, end = VERTICAL if leaving else 0, ROWS - VERTICAL
     raised, lowered = X[0].copy(), X[ROWS].copy()
-    if leaving:
-        start = VERTICAL
-        if not _column(X, arm, raised, leave, 1, 1, safe, targets):
+    for side in range(0 if leaving else 1, 2):
+        q, switch = (raised, leave) if side == 0 else (lowered, arrive)
+        row, direction = (1, 1) if side == 0 else (ROWS - 1, -1)
+        if not _column(X, arm, q, switch, row, direction, safe, targets):
             return False
-    if not _column(X, arm, lowered, arrive, ROWS - 1, -1, safe, targets):
-        return False
     up, down = (start + 3 if leaving else start), end - 3
     for t in range(start + 1, end):
         for i in range(ARM):
@@ -379,6 +390,14 @@ def _guess(X, arm, leave, leaving, arrive, bodies, obstacles, targets):
             else:
                 X[t, i] = lowered[i] + (X[end, i] - lowered[i]) * (t - down) / (end - down)
     return True
+
+
+@njit(cache=True)
+def _within_limits(arm, q):
+    inside = True
+    for i in range(ARM):
+        inside = inside and arm.lower[i] <= q[i] <= arm.upper[i]
+    return inside
 
 
 @njit(cache=True)
@@ -398,7 +417,7 @@ def _column(X, arm, q, switch, row, direction, safe, targets):
     for k in range(4):
         top = q.copy()
         target[2] = switch[2] + RISE + (1.0 - 0.25 * k) * max(0.0, safe - switch[2] - RISE)
-        if reach_to(arm, top, target) and (top >= arm.lower).all() and (top <= arm.upper).all():
+        if reach_to(arm, top, target) and _within_limits(arm, top):
             q[:] = top
             break
     return True
@@ -416,9 +435,7 @@ def retreat(X, arm, leave, bodies, obstacles):
         share = t / steps
         target[2] = leave[2] + RISE * share * share * (3 - 2 * share)
         X[t] = X[t - 1]
-        if not reach_to(arm, X[t], target):
-            return -1.0
-        if (X[t] < arm.lower).any() or (X[t] > arm.upper).any():
+        if not reach_to(arm, X[t], target) or not _within_limits(arm, X[t]):
             return -1.0
     margin = np.zeros((len(bodies.link), len(obstacles)))
     return dense_check(X, arm, bodies, obstacles, margin, np.zeros((steps, 2)))

@@ -50,7 +50,7 @@ SHARES = (
 )
 QUANTILES = np.linspace(0, 1, 201)
 """Shares at which distributions of times are drawn; the middle one is the median."""
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "svg.fonttype": "none",
@@ -89,7 +89,7 @@ def svg(
 
     `size` in inches; `given` goes to `draw` after the axes.
     """
-    with mpl.rc_context({**_STYLE, "svg.hashsalt": name}):
+    with mpl.rc_context({**STYLE, "svg.hashsalt": name}):
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasSVG(figure)
         draw(*figure.subplots(1, panels, squeeze=False)[0], **given)

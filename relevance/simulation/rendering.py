@@ -1,9 +1,9 @@
 """Pictures of scenes: image, mask, canonical views and how much of each object shows.
 
-Boxes are drawn by pybullet's TinyRenderer (no GPU, no display). The table is a plane of one
-colour under one light, so its pixels are filled in closed form, in a third of the time; the
-mask stays that of a full render. Shadows are closed form too, on the table and on the boxes:
-TinyRenderer's shadow map speckles faces that the light grazes. So is the number of pixels
+Boxes are drawn by pybullet's TinyRenderer (no GPU, no display). The table is a plane under one
+light, so its pixels (and the pattern on it, if any) are filled in closed form, in a third of the
+time; the mask stays that of a full render. Shadows are closed form too, on the table and on the
+boxes: TinyRenderer's shadow map speckles faces that the light grazes. So is the number of pixels
 that a box would show alone (a convex silhouette); nothing is rendered twice. Light arguments
 persist in pybullet from one call to the next, so every call passes all of them; each scene
 starts from `resetSimulation`, which leaks least. The arm is left out: its meshes cost more
@@ -20,10 +20,11 @@ from functools import lru_cache
 from types import TracebackType
 
 import numpy as np
-import pybullet  # pyright: ignore[reportMissingImports]  (compiled, has no stubs)
 
 from relevance.sampling import camera_up, project, vertices
-from relevance.scene import Box, Camera, Light, Scene, Table
+from relevance.scene import Box, Camera, Color, Light, Scene, Table
+from relevance.simulation.bullet import pybullet
+from relevance.simulation.textures import pattern
 
 VIEW_PIXELS = 32
 """Edge of a canonical view, pixels."""
@@ -62,6 +63,7 @@ _VIEW_CAMERA = Camera(
 )
 _VIEW_YAW = 0.5
 _CACHED_VIEWS = 1024
+_CACHED_SHADES = 64
 _PARKED = (0.0, 0.0, -1000.0)  # behind the far plane of every view
 
 
@@ -92,7 +94,7 @@ class Renderer:
         if self._client < 0:
             raise RuntimeError("pybullet gave no client: too many are open in this process")
         self._views: OrderedDict[tuple, np.ndarray] = OrderedDict()
-        self._table_colors: dict[tuple, tuple[np.uint32, np.uint32]] = {}
+        self._table_colors: OrderedDict[tuple, tuple[np.uint32, np.uint32]] = OrderedDict()
 
     def __enter__(self) -> Renderer:
         return self
@@ -113,7 +115,10 @@ class Renderer:
 
     def render(self, scene: Scene) -> Rendering:
         """Scene image, mask, canonical views and visibility of every object."""
-        lit, shadowed = self._table_shades(scene.table, scene.light)
+        shades = self._table_shades(scene.table.color, scene.light)
+        if scene.table.texture is not None:
+            second = self._table_shades(scene.table.texture.color, scene.light)
+            shades = _textured(scene, shades, second)
         pybullet.resetSimulation(physicsClientId=self._client)
         bodies, views = [], []
         for box in scene.objects:
@@ -124,10 +129,11 @@ class Renderer:
         for body, box in zip(bodies, scene.objects, strict=True):
             self._put(body, box.position, box.yaw)
         words, segments = self._picture(scene.camera, scene.light)
-        mask = np.zeros(segments.shape, dtype=np.uint8)
-        for i, body in enumerate(bodies):
-            mask[segments == body] = i + 1
-        _fill_ground(words, mask == 0, scene, lit, shadowed)
+        # One look-up a pixel; body ids count up from 0, and -1 is nothing.
+        values = np.zeros(max(bodies) + 2, dtype=np.uint8)
+        values[np.array(bodies) + 1] = np.arange(1, len(bodies) + 1)
+        mask = values[segments + 1]
+        _fill_ground(words, mask == 0, scene, *shades)
         image = _unpack(words)
         if scene.light.shadow:
             _shade_boxes(image, mask, scene)
@@ -203,13 +209,13 @@ class Renderer:
             self._views.popitem(last=False)
         return view
 
-    def _table_shades(self, table: Table, light: Light) -> tuple[np.uint32, np.uint32]:
-        """The table's colour in the light and in a shadow, packed.
+    def _table_shades(self, color: Color, light: Light) -> tuple[np.uint32, np.uint32]:
+        """A colour of the table in the light and in a shadow, packed.
 
         The lit one is what TinyRenderer makes of a patch of it; a plane has the same shade all
         over, since light and normal are the same. Changes the simulated world.
         """
-        key = (table.color, light)
+        key = (color, light)
         if key not in self._table_colors:
             pybullet.resetSimulation(physicsClientId=self._client)
             # GEOM_PLANE has no visual; a mesh quad does.
@@ -219,7 +225,7 @@ class Renderer:
                 indices=[0, 1, 2, 0, 2, 3],
                 normals=[[0, 0, 1]] * 4,
                 uvs=[[0, 0], [1, 0], [1, 1], [0, 1]],
-                rgbaColor=[*table.color, 1.0],
+                rgbaColor=[*color, 1.0],
                 specularColor=[0.0, 0.0, 0.0],
                 physicsClientId=self._client,
             )
@@ -228,9 +234,11 @@ class Renderer:
             )
             camera = Camera(eye=(-0.5, 0.0, 0.5), width=8, height=8, fov=10.0)
             lit = _unpack(self._picture(camera, light)[0])[4, 4]
-            ambient = 255 * light.ambient * np.array(table.color)
+            ambient = 255 * light.ambient * np.array(color)
             shadowed = ambient + _SHADOWED * np.maximum(lit - ambient, 0)
             self._table_colors[key] = (_pack(lit), _pack(shadowed))
+            if len(self._table_colors) > _CACHED_SHADES:
+                self._table_colors.popitem(last=False)
         return self._table_colors[key]
 
     def _pixels_alone(self, i: int, bodies: Sequence[int], scene: Scene) -> int:
@@ -261,13 +269,41 @@ def rejects(rendering: Rendering) -> str | None:
     return None
 
 
+def _textured(
+    scene: Scene, first: tuple[np.uint32, np.uint32], second: tuple[np.uint32, np.uint32]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The table's pixels in the light and in a shadow, packed, (H, W) each.
+
+    Both colours of the texture come with their shades; the pattern blends those.
+    """
+    texture = scene.table.texture
+    assert texture is not None, "a plain table has one shade"
+    on_table, x, y = _ground(scene.camera, scene.table)
+    share = pattern(texture, x[on_table], y[on_table])[:, None]
+    blended = []
+    for one, other in zip(first, second, strict=True):
+        a, b = (_unpack(np.array([[word]]))[0, 0].astype(float) for word in (one, other))
+        pixels = np.full((*on_table.shape, 4), 255, dtype=np.uint8)
+        pixels[on_table, :3] = np.rint(a + share * (b - a))
+        blended.append(pixels.view(np.uint32)[..., 0])
+    return blended[0], blended[1]
+
+
 def _fill_ground(
-    words: np.ndarray, empty: np.ndarray, scene: Scene, lit: np.uint32, shadowed: np.uint32
+    words: np.ndarray,
+    empty: np.ndarray,
+    scene: Scene,
+    lit: np.uint32 | np.ndarray,
+    shadowed: np.uint32 | np.ndarray,
 ) -> None:
-    """Paint table, its shadows and the floor where no box is: packed pixels, in place."""
+    """Paint table, its shadows and the floor where no box is: packed pixels, in place.
+
+    lit, shadowed: the table's pixels, one for all or (H, W).
+    """
     camera, source = scene.camera, _source(scene.light)
     on_table, x_ground, y_ground = _ground(camera, scene.table)
     picture = np.where(on_table, lit, _FLOOR)
+    shadowed = np.broadcast_to(shadowed, picture.shape)
     for box in scene.objects if scene.light.shadow else ():
         if source[2] <= box.top:
             continue  # The light stands lower than the box: no shadow falls on the table.
@@ -280,7 +316,7 @@ def _fill_ground(
         if rows and columns:
             where = (rows, columns)
             dark = _inside(_hull(cast), x_ground[where], y_ground[where]) & on_table[where]
-            picture[where][dark] = shadowed
+            np.copyto(picture[where], shadowed[where], where=dark)
     np.copyto(words, picture, where=empty)
 
 
@@ -289,6 +325,8 @@ def _shade_boxes(image: np.ndarray, mask: np.ndarray, scene: Scene) -> None:
     light, source, eye = scene.light, _source(scene.light), np.array(scene.camera.eye)
     rays = _rays(scene.camera)
     low, high = _shadow_bounds(scene.objects, source)
+    all_rows, all_columns = np.nonzero(mask)
+    shown = mask[all_rows, all_columns]
     for i, box in enumerate(scene.objects):
         centre, extents = np.array(box.position[:2]), np.array(box.extents)
         near_it = np.all((low <= centre + extents) & (high >= centre - extents), axis=1)
@@ -299,7 +337,8 @@ def _shade_boxes(image: np.ndarray, mask: np.ndarray, scene: Scene) -> None:
         ]
         if not casters:
             continue
-        rows, columns = np.nonzero(mask == i + 1)
+        mine = shown == i + 1
+        rows, columns = all_rows[mine], all_columns[mine]
         sight = rays[rows, columns]
         points = eye + _crossing(box, eye, sight)[0][:, None] * sight
         dark = np.zeros(len(points), dtype=bool)

@@ -23,9 +23,9 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import pybullet  # pyright: ignore[reportMissingImports]  (compiled, has no stubs)
 
 from relevance.scene import CONTACT_TOLERANCE, Goal, Phase, Scene, goal_holds
+from relevance.simulation.bullet import pybullet
 
 MAX_PENETRATION = 1e-3
 """Deepest overlap that a replayed plan may have, m."""

@@ -3,14 +3,28 @@
 The only importer of pyarrow, duckdb and webdataset.
 """
 
-from relevance.store.dataset import SPLITS, Dataset, differences, file_hash, replacing, sql
-from relevance.store.images import MEMBERS, VIEW_SIZE, Pictures, Sample
+from relevance.store.compacting import compact
+from relevance.store.dataset import SPLITS, Dataset, Labelling, Source, differences
+from relevance.store.exporting import export
+from relevance.store.images import MEMBERS, VIEW_SIZE, Pictures, Sample, decode
+from relevance.store.places import (
+    absolute,
+    copy_file,
+    file_hash,
+    is_remote,
+    locate,
+    replacing,
+    sweep,
+)
+from relevance.store.queries import sql
+from relevance.store.synthetic import synthetic_labels
 from relevance.store.tables import (
     SCHEMAS,
     TABLES,
     Column,
     DatasetError,
     TableSchema,
+    empty_size,
     table_schema,
     type_name,
 )
@@ -24,13 +38,25 @@ __all__ = [
     "Column",
     "Dataset",
     "DatasetError",
+    "Labelling",
     "Pictures",
     "Sample",
+    "Source",
     "TableSchema",
+    "absolute",
+    "compact",
+    "copy_file",
+    "decode",
     "differences",
+    "empty_size",
+    "export",
     "file_hash",
+    "is_remote",
+    "locate",
     "replacing",
     "sql",
+    "sweep",
+    "synthetic_labels",
     "table_schema",
     "type_name",
 ]

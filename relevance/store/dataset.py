@@ -3,6 +3,10 @@
 Every file is written to a temporary name and renamed; it exists whole or not at all. The
 scenes file of a shard carries the hash of the shard's tar. Tars are written with the standard
 library and read with webdataset, whose import loads torch: workers that make shards stay light.
+
+Plans and labels of another planner version, goal set or label policy live beside the current
+ones, in `beside/planner=V/config=HASH/`, see `Labelling`. A merged dataset holds the shards of
+its sources by reference, see `Source`.
 """
 
 from __future__ import annotations
@@ -13,9 +17,8 @@ import json
 import os
 import re
 import tarfile
-import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +28,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from relevance.scene import content_hash
+from relevance.store import queries
 from relevance.store.images import Pictures, Sample, decode, encode
+from relevance.store.places import file_hash, is_remote, locate, replacing, sweep
 from relevance.store.tables import (
-    SCHEMAS,
-    TABLES,
     DatasetError,
-    nulls,
-    one_line,
     read_footer,
     read_parquet,
     table_schema,
@@ -40,30 +41,45 @@ from relevance.store.tables import (
 
 SPLITS = ("train", "validation", "test")
 
-_STALE = 86_400.0  # s; a temporary file that old belongs to nobody
-_READ = (
-    "hive_partitioning = true, hive_types_autocast = false, filename = true, file_row_number = true"
-)
+SHARDED = ("scenes", "plans", "timings", "labels", "durations")
+"""The tables that generating and labelling make, which a merged dataset refers to."""
 
 
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+@dataclass(frozen=True, slots=True, kw_only=True, order=True)
+class Labelling:
+    """One way in which a dataset's goals were planned and labelled."""
+
+    planner: str
+    """Version of the planner."""
+    config: str
+    """Hash of the plan settings, goal set included."""
+    policy: str
+    """How relevance was read from the plans."""
+
+    @property
+    def made_by(self) -> dict[str, str]:
+        """What the footer of a labels file says."""
+        return {**self.planned_by, "policy": self.policy}
+
+    @property
+    def planned_by(self) -> dict[str, str]:
+        """What the footer of a plans file says."""
+        return {"config": self.config, "planner": self.planner}
 
 
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path` that becomes `path` when the block ends well."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.parent / f".{path.name}.{os.getpid()}-{os.urandom(3).hex()}.tmp"
-    try:
-        yield temporary
-        with temporary.open("rb+") as stream:
-            os.fsync(stream.fileno())  # the name must not outlive the bytes in a power cut
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """A dataset whose shards a merged dataset refers to."""
+
+    dataset: Dataset
+    first: Mapping[str, int]
+    """The number that its shard 0 of each split has in the merged dataset."""
+    count: Mapping[str, int]
+    """Its number of shards of each split when it was merged."""
+
+    def number(self, split: str, shard: int) -> int | None:
+        """The merged dataset's number of a shard; None when it was made after the merge."""
+        return self.first[split] + shard if shard < self.count[split] else None
 
 
 class Dataset:
@@ -72,6 +88,14 @@ class Dataset:
     def __init__(self, path: Path, description: dict[str, Any]) -> None:
         self.path = path
         self._description = description
+        self.sources = tuple(self._sources())
+
+    def _sources(self) -> Iterator[Source]:
+        for item in self._description.get("sources", ()):
+            path = locate(item["path"])
+            if not is_remote(path):
+                path = Path(os.path.normpath(self.path / path))
+            yield Source(dataset=Dataset.open(path), first=item["first"], count=item["count"])
 
     def __repr__(self) -> str:
         return f"Dataset({str(self.path)!r})"
@@ -79,7 +103,7 @@ class Dataset:
     @classmethod
     def open(cls, path: str | Path) -> Dataset:
         """Open an existing dataset; raises DatasetError when there is none."""
-        path = Path(path)
+        path = locate(path)
         file = path / "dataset.json"
         if not file.is_file():
             raise DatasetError(f"{path}: no dataset.json there, expected a dataset folder")
@@ -97,7 +121,7 @@ class Dataset:
 
         Raises DatasetError that names the first difference otherwise.
         """
-        path = Path(path)
+        path = locate(path)
         wanted = json.loads(json.dumps(description))
         if (path / "dataset.json").exists():
             there = cls.open(path)
@@ -106,7 +130,7 @@ class Dataset:
                     f"{path / 'dataset.json'}: {key}: the dataset was made with {found!r}, "
                     f"found {expected!r}; take another folder or the same settings"
                 )
-            there._sweep()
+            sweep(path)
             return there
         dataset = cls(path, wanted)
         dataset.describe(wanted)
@@ -134,11 +158,16 @@ class Dataset:
         shard: int | None = None,
         predicate: str | None = None,
         name: str | None = None,
+        stage: str | None = None,
+        of: Labelling | None = None,
     ) -> Path:
-        """The Parquet file of a shard; which keys it takes is `path` in the table's schema."""
+        """The Parquet file of a shard; which keys it takes is `path` in the table's schema.
+
+        `of` asks for plans, timings or labels beside the current ones.
+        """
         schema = table_schema(table)
         given = {"split": split, "shard": shard, "predicate": predicate, "name": name}
-        given = {key: value for key, value in given.items() if value is not None}
+        given = {k: v for k, v in {**given, "stage": stage}.items() if v is not None}
         if set(given) != set(schema.keys):
             raise DatasetError(
                 f"table {table}: expected {', '.join(schema.keys)} to name a file, "
@@ -148,30 +177,93 @@ class Dataset:
             raise DatasetError(f"split {split!r}: expected one of {', '.join(SPLITS)}")
         if name is not None and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
             raise DatasetError(f"name {name!r}: expected letters, digits, dot, dash, underscore")
-        return self.path / schema.path.format(**given)
+        home = self
+        if split is not None and shard is not None and table in SHARDED:
+            home, given["shard"] = self._home(split, shard)
+        file = schema.path.format(**given).removeprefix(f"{table}/")
+        return home.path / _folder(table, of) / file
 
     def images_path(self, split: str, shard: int) -> Path:
         """The image tar of a shard."""
-        return self.path / f"images/split={split}/shard-{shard:06d}.tar"
+        home, number = self._home(split, shard)
+        return home.path / f"images/split={split}/shard-{number:06d}.tar"
+
+    def _home(self, split: str, shard: int) -> tuple[Dataset, int]:
+        """The dataset that holds a shard, and its number there."""
+        for source in self.sources:
+            number = shard - source.first[split]
+            if 0 <= number < source.count[split]:
+                return source.dataset._home(split, number)
+        return self, shard
 
     def has(self, table: str, **keys: Any) -> bool:
         """Whether the file of that shard exists (then it is whole)."""
         return self.shard_path(table, **keys).is_file()
 
-    def files(self, table: str, **where: Any) -> list[Path]:
-        """Files of a table in order, only those whose path agrees with `where`."""
-        keep = []
-        for file in sorted((self.path / table).rglob("*.parquet")):
-            parts = self.file_keys(file)
-            if not file.name.startswith(".") and all(
-                str(parts[key]) == str(value) for key, value in where.items() if key in parts
-            ):
-                keep.append(file)
-        return keep
+    def files(self, table: str, *, of: Labelling | None = None, **where: Any) -> list[Path]:
+        """Files of a table in order, only those whose path agrees with `where`.
+
+        `of` asks for plans, timings or labels beside the current ones.
+        """
+        found = (self.path / _folder(table, of)).rglob("*.parquet")
+        keep = [file for file in sorted(found) if not file.name.startswith(".")]
+        if table in SHARDED:
+            for source in self.sources:
+                mine = source.dataset.files(table, of=of)
+                keep += [file for file in mine if "shard" in self.file_keys(file)]
+        return [file for file in keep if _agrees(self.file_keys(file), where)]
+
+    def labellings(self) -> list[Labelling]:
+        """The labellings that are beside the current one (some of their shards, at least)."""
+        found = {labelling for s in self.sources for labelling in s.dataset.labellings()}
+        for file in (self.path / "beside").rglob("labels/**/*.parquet"):
+            keys = self.file_keys(file)
+            if not file.name.startswith("."):
+                mine = (keys["planner"], keys["config"], keys["policy"])
+                found.add(Labelling(planner=mine[0], config=mine[1], policy=mine[2]))
+        return sorted(found)
+
+    def files_beside(self) -> list[Path]:
+        """Every file of the labellings that are beside the current one."""
+        files = [
+            file
+            for of in self.labellings()
+            for table in ("plans", "timings", "labels")
+            for file in self.files(table, of=of)
+        ]
+        return list(dict.fromkeys(files))
+
+    @property
+    def labelling(self) -> Labelling | None:
+        """How the dataset is labelled now; None when dataset.json does not say it.
+
+        A merged dataset's is that of its first source.
+        """
+        if self.sources:
+            return self.sources[0].dataset.labelling
+        said = self.description
+        try:
+            return Labelling(
+                planner=said["planner_version"],
+                config=said["hashes"]["plans"],
+                policy=said["config"]["policy"],
+            )
+        except (KeyError, TypeError):
+            return None
 
     def file_keys(self, file: Path) -> dict[str, Any]:
-        """What a file's path says of its rows: `key=value` folders and the shard number."""
-        parts: dict[str, Any] = {}
+        """What a file's path says of its rows: `key=value` folders and the shard number.
+
+        A source's shard that was made after the merge has no number.
+        """
+        for source in self.sources:
+            if file.is_relative_to(source.dataset.path) and not file.is_relative_to(self.path):
+                parts = source.dataset.file_keys(file)
+                if "shard" in parts:
+                    number = source.number(parts["split"], parts.pop("shard"))
+                    return parts if number is None else {**parts, "shard": number}
+                return parts
+        parts = {}
         for part in file.relative_to(self.path).parts[:-1]:
             key, sign, value = part.partition("=")
             if sign:
@@ -179,6 +271,12 @@ class Dataset:
         if found := re.fullmatch(r"shard-(\d+)", file.stem):
             parts["shard"] = int(found[1])
         return parts
+
+    def name_of(self, file: Path) -> str:
+        """A file's name within the dataset; a source's file by its way there."""
+        if file.is_relative_to(self.path):
+            return str(file.relative_to(self.path))
+        return str(file) if is_remote(file) else os.path.relpath(file, self.path)
 
     def shards(self, split: str, family: str | None = None) -> list[int]:
         """Numbers of the finished shards of a split (and family), in order."""
@@ -188,12 +286,7 @@ class Dataset:
             if item["split"] == split
         }
         numbers = [self.file_keys(file)["shard"] for file in self.files("scenes", split=split)]
-        return [n for n in numbers if family is None or families.get(n) == family]
-
-    def _sweep(self) -> None:
-        for file in self.path.rglob(".*.tmp"):
-            if time.time() - file.stat().st_mtime > _STALE:
-                file.unlink(missing_ok=True)
+        return sorted(n for n in numbers if family is None or families.get(n) == family)
 
     # tables -----------------------------------------------------------------------------------
 
@@ -206,6 +299,8 @@ class Dataset:
         shard: int | None = None,
         predicate: str | None = None,
         name: str | None = None,
+        stage: str | None = None,
+        of: Labelling | None = None,
         made_by: Mapping[str, str] | None = None,
     ) -> Path:
         """Write the rows of one file, checked against the schema; equal rows, equal bytes.
@@ -213,7 +308,9 @@ class Dataset:
         A nullable column may be left out of a row. `made_by` goes to the file's metadata, see
         `metadata`. Raises DatasetError naming file, row, column, expected and found.
         """
-        path = self.shard_path(table, split=split, shard=shard, predicate=predicate, name=name)
+        path = self.shard_path(
+            table, split=split, shard=shard, predicate=predicate, name=name, stage=stage, of=of
+        )
         content = to_parquet(table_schema(table), rows, made_by or {}, path)
         with replacing(path) as temporary:
             temporary.write_bytes(content)
@@ -225,16 +322,24 @@ class Dataset:
 
     def read_file(self, file: Path) -> pa.Table:
         """Read one Parquet file whole; hash, version and columns are checked."""
-        return read_parquet(table_schema(self._table_of(file)), file)
+        body = read_parquet(table_schema(self._table_of(file)), file)
+        keys = self.file_keys(file)
+        if self.sources and "shard" in keys and "shard" in body.column_names and len(body):
+            field = body.schema.field("shard")
+            numbers = pa.array([keys["shard"]] * len(body), type=field.type)
+            body = body.set_column(body.column_names.index("shard"), field, numbers)
+        return body
 
-    def read_rows(self, table: str, **where: Any) -> list[dict[str, Any]]:
+    def read_rows(
+        self, table: str, *, of: Labelling | None = None, **where: Any
+    ) -> list[dict[str, Any]]:
         """Rows of a table as dicts, in the order of files and rows; `where` gives column=value."""
         schema = table_schema(table)
         unknown = set(where) - {column.name for column in schema.columns}
         if unknown:
             raise DatasetError(f"table {table}: has no column {sorted(unknown)[0]!r}")
         rows: list[dict[str, Any]] = []
-        for file in self.files(table, **where):
+        for file in self.files(table, of=of, **where):
             body = self.read_file(file)
             for key, value in where.items():
                 body = body.filter(pc.field(key) == value)
@@ -242,7 +347,11 @@ class Dataset:
         return rows
 
     def _table_of(self, file: Path) -> str:
-        return file.relative_to(self.path).parts[0]
+        for source in self.sources:
+            if file.is_relative_to(source.dataset.path) and not file.is_relative_to(self.path):
+                return source.dataset._table_of(file)
+        parts = file.relative_to(self.path).parts
+        return parts[3] if parts[0] == "beside" else parts[0]
 
     # images -----------------------------------------------------------------------------------
 
@@ -329,63 +438,30 @@ class Dataset:
     # queries ----------------------------------------------------------------------------------
 
     def connect(
-        self, *, origin: bool = False, without: Collection[Path] = (), memory: bool = False
+        self,
+        *,
+        policy: str | None = None,
+        origin: bool = False,
+        without: Collection[Path] = (),
+        memory: bool = False,
     ) -> duckdb.DuckDBPyConnection:
-        """DuckDB with a view per table and all of `schemas/views.sql`; paths are absolute.
+        """DuckDB with a view per table and all of `schemas/*.sql`; paths are absolute.
 
-        A table without files is an empty view. With `origin` the table views also have `file`
-        (within the dataset) and `row` (from 0); files in `without` are left out. With `memory`
-        the tables are copied, for many queries on a small dataset. Raises DatasetError for a
-        file that does not have the schema's columns.
+        A table without files is an empty view. `policy` chooses the labels; the dataset's own
+        policy when None. With `origin` the table views also have `file` (within the dataset) and
+        `row` (from 0); files in `without` are left out. With `memory` the tables are copied, for
+        many queries on a small dataset. Raises DatasetError for a file that does not have the
+        schema's columns.
         """
-        connection = duckdb.connect()
-        for table in TABLES:
-            schema = table_schema(table)
-            files = [file for file in self.files(table) if file not in without]
-            for file in files:
-                self.metadata(file)
-            if files:
-                body = ", ".join(f'"{c.name}"::{c.type} AS "{c.name}"' for c in schema.columns)
-                if origin:
-                    start = len(str(self.path.resolve())) + 2
-                    body += f", substr(filename, {start}) AS file, file_row_number AS row"
-                if without:
-                    source = "[" + ", ".join(_quoted(file.resolve()) for file in files) + "]"
-                else:
-                    source = _quoted(self.path.resolve() / table, "/**/*.parquet")
-                body += f" FROM read_parquet({source}, {_READ})"
-            else:
-                body = nulls(schema.columns)
-                if origin:
-                    body += ", NULL::VARCHAR AS file, NULL::BIGINT AS row"
-                body += " WHERE false"
-            connection.execute(f"CREATE {'TABLE' if memory else 'VIEW'} {table} AS SELECT {body}")
-        connection.execute((SCHEMAS / "views.sql").read_text())
-        return connection
+        return queries.connect(self, policy=policy, origin=origin, without=without, memory=memory)
 
     def content_hash(self) -> str:
         """16 hex digits that change with any label or image (hashes kept in the files)."""
         hashes = {}
         for table, key in (("labels", "sha256"), ("scenes", "images_sha256")):
             for file in self.files(table):
-                hashes[str(file.relative_to(self.path))] = self.metadata(file).get(key, "")
+                hashes[self.name_of(file)] = self.metadata(file).get(key, "")
         return content_hash(hashes)
-
-
-def _quoted(path: Path, pattern: str = "") -> str:
-    """A path as SQL text; its own brackets, stars and question marks are names, not patterns."""
-    escaped = re.sub(r"[\[*?]", r"[\g<0>]", str(path)) + pattern
-    return "'" + escaped.replace("'", "''") + "'"
-
-
-def sql(path: str | Path, query: str) -> tuple[list[str], list[tuple[Any, ...]]]:
-    """Column names and rows of a query over a dataset's views; DatasetError for a bad query."""
-    with Dataset.open(path).connect() as connection:
-        try:
-            result = connection.execute(query)
-            return [column[0] for column in result.description or ()], result.fetchall()
-        except duckdb.Error as error:
-            raise DatasetError(f"query: {one_line(error)}") from None
 
 
 def differences(
@@ -400,3 +476,16 @@ def differences(
             yield from differences(found.get(key), expected.get(key), dotted, ignore)
     elif found != expected:
         yield prefix, found, expected
+
+
+def _folder(table: str, of: Labelling | None) -> str:
+    if of is None:
+        return table
+    if table not in ("plans", "timings", "labels"):
+        raise DatasetError(f"table {table}: expected plans, timings or labels beside others")
+    folder = f"beside/planner={of.planner}/config={of.config}/{table}"
+    return f"{folder}/policy={of.policy}" if table == "labels" else folder
+
+
+def _agrees(keys: Mapping[str, Any], where: Mapping[str, Any]) -> bool:
+    return all(str(keys[key]) == str(value) for key, value in where.items() if key in keys)

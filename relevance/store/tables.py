@@ -24,7 +24,18 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-TABLES = ("scenes", "plans", "timings", "labels", "checkpoints", "predictions", "evaluations")
+from relevance.store.places import is_remote
+
+TABLES = (
+    "scenes",
+    "plans",
+    "timings",
+    "labels",
+    "durations",
+    "checkpoints",
+    "predictions",
+    "evaluations",
+)
 SCHEMAS = Path(__file__).parents[2] / "schemas"
 
 _BLANK = "0" * 64  # stands in the footer while the rest is hashed
@@ -95,13 +106,17 @@ def table_schema(table: str) -> TableSchema:
 
 
 def to_parquet(
-    schema: TableSchema, rows: Sequence[Mapping[str, Any]], made_by: Mapping[str, str], where: Path
+    schema: TableSchema,
+    rows: Sequence[Mapping[str, Any]] | pa.Table,
+    made_by: Mapping[str, str],
+    where: Path,
 ) -> bytes:
     """The bytes of a Parquet file; raises DatasetError naming file, row, column, expected, found.
 
-    A nullable column may be left out of a row. `made_by` goes into the file's metadata.
+    A nullable column may be left out of a row. `made_by` goes into the file's metadata. An Arrow
+    table of the schema is written as it is.
     """
-    body = _to_arrow(schema, rows, where)
+    body = rows if isinstance(rows, pa.Table) else _to_arrow(schema, rows, where)
     buffer = io.BytesIO()
     with pq.ParquetWriter(
         buffer, schema.arrow, compression="zstd", write_page_checksum=True
@@ -119,6 +134,12 @@ def to_parquet(
     assert blank.count(_BLANK.encode()) == 1, "the place of the hash must be unique"
     digest = hashlib.sha256(blank).hexdigest()
     return blank.replace(_BLANK.encode(), digest.encode())
+
+
+@cache
+def empty_size(table: str) -> int:
+    """Bytes of a file of that table without any row."""
+    return len(to_parquet(table_schema(table), [], {}, Path(table)))
 
 
 def read_footer(schema: TableSchema, file: Path) -> dict[str, str]:
@@ -176,8 +197,12 @@ def one_line(error: BaseException) -> str:
     return text.splitlines()[0]
 
 
-def _opened(file: Path, source: Path | io.BytesIO) -> pq.ParquetFile:
+def _opened(file: Path, source: Any) -> pq.ParquetFile:
     try:
+        if is_remote(file) and source is file:
+            # its end holds all that is asked for; one request
+            with source.open("rb", cache_type="readahead", block_size=2**16) as stream:
+                return pq.ParquetFile(stream, page_checksum_verification=True)
         return pq.ParquetFile(source, page_checksum_verification=True)
     except FileNotFoundError:
         raise DatasetError(f"{file}: does not exist, expected a Parquet file") from None

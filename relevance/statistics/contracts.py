@@ -1,4 +1,4 @@
-"""What a dataset holds and whether it keeps its contracts.
+"""Whether a dataset keeps its contracts.
 
 `check` reads every byte: hashes and schemas of all files, the rules of `schemas/checks.sql`
 between rows, and what SQL cannot say (a scene is possible and is what its id says, a plan's
@@ -11,14 +11,14 @@ import contextlib
 import io
 import re
 import tarfile
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from relevance.generation import ShardSpec, load_config, shards_of
+from relevance.generation import ShardSpec, integrity, load_config, shards_of
 from relevance.labels import stored_scene
 from relevance.scene import (
     Pose,
@@ -55,120 +55,6 @@ class Breach:
         return ": ".join(part for part in (self.file, row, column, self.message) if part)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Table:
-    """A small table to print: one view of the dataset."""
-
-    name: str
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Any, ...], ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Statistics:
-    """How much a dataset holds, and its tables."""
-
-    path: str
-    scenes: int
-    goals: int
-    plans: int
-    """Goals with a plan that holds."""
-    queries: int
-    relevant: int
-    shards: tuple[int, int]
-    """Finished shards of scenes, and all of them."""
-    labelled: tuple[int, int]
-    """Finished shards of labels (one a predicate), and all of them."""
-    tables: tuple[Table, ...]
-
-    def __getitem__(self, name: str) -> Table:
-        """The table made from the view `name`."""
-        return next(table for table in self.tables if table.name == name)
-
-
-VIEWS = {
-    "paper_label_distribution": "Label distribution (the paper's table)",
-    "label_balance": "Label balance of the queries",
-    "plan_lengths": "Plan lengths",
-    "plan_failures": "Goals without a plan, by reason",
-    "plan_verdicts": "Do the plans hold?",
-    "plan_seconds": "Planning time, s",
-    "visibility": "Visibility of the objects",
-    "scene_sizes": "Scenes by number of boxes",
-}
-"""The views that `statistics` shows, with their titles."""
-
-
-def statistics(root: str | Path) -> Statistics:
-    """Count and tabulate a dataset through its DuckDB views."""
-    dataset = Dataset.open(root)
-    specs = shards_of(dataset)
-    with dataset.connect() as connection:
-        tables = []
-        for view, title in VIEWS.items():
-            found = connection.execute(f"FROM {view}")
-            columns = tuple(column[0] for column in found.description or ())
-            rows = tuple(tuple(row) for row in found.fetchall())
-            tables.append(Table(name=view, title=title, columns=columns, rows=rows))
-        totals = connection.execute(
-            "SELECT (SELECT count(*) FROM scenes), (SELECT count(*) FROM plans),"
-            " (SELECT count(*) FROM plans WHERE holds),"
-            " (SELECT count(*) FROM labels WHERE NOT is_goal_object),"
-            " (SELECT count(*) FROM labels WHERE NOT is_goal_object AND relevant)"
-        ).fetchone()
-    assert totals is not None, "a query of counts has one row"
-    scenes, goals, plans, queries, relevant = totals
-    return Statistics(
-        path=str(root),
-        scenes=scenes,
-        goals=goals,
-        plans=plans,
-        queries=queries,
-        relevant=relevant,
-        shards=(len(dataset.files("scenes")), len(specs)),
-        labelled=(len(dataset.files("labels")), sum(len(spec.predicates) for spec in specs)),
-        tables=tuple(tables),
-    )
-
-
-def card(found: Statistics) -> str:
-    """A dataset card in Markdown."""
-    share = f"{found.relevant / found.queries:.1%}" if found.queries else "none"
-    lines = [
-        f"# Dataset {Path(found.path).name}",
-        "",
-        f"{found.scenes} scenes, {found.goals} goals, {found.plans} plans that hold, "
-        f"{found.queries} queries ({share} relevant); "
-        f"{found.shards[0]} of {found.shards[1]} shards made, "
-        f"{found.labelled[0]} of {found.labelled[1]} labelled.",
-    ]
-    for table in found.tables:
-        lines += [
-            "",
-            f"## {table.title}",
-            "",
-            _bar(table.columns),
-            _bar("---" for _ in table.columns),
-        ]
-        lines += [_bar(cell(value) for value in row) for row in table.rows]
-    return "\n".join(lines) + "\n"
-
-
-def cell(value: Any) -> str:
-    """A value as a table shows it: three significant digits, a dash for null."""
-    if value is None:
-        return "-"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
-def _bar(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-# contracts ------------------------------------------------------------------------------------
-
-
 def check(
     root: str | Path, *, render: bool = True, progress: Progress | None = None
 ) -> list[Breach]:
@@ -178,8 +64,12 @@ def check(
     when there is no dataset at all.
     """
     dataset = Dataset.open(root)
+    if dataset.sources:
+        return _merged(dataset, render, progress)
     breaches = list(_description(dataset))
+    breaches += [Breach(file=file, message=message) for file, message in integrity(dataset)]
     files = [file for table in TABLES for file in dataset.files(table)]
+    files += dataset.files_beside()
     unreadable: set[Path] = set()
     odd: set[Path] = set()
     for done, file in enumerate(files, 1):
@@ -200,6 +90,18 @@ def check(
     breaches += _scenes(dataset, whole, render)
     breaches += _goals(dataset, left_out)
     return breaches
+
+
+def _merged(dataset: Dataset, render: bool, progress: Progress | None) -> list[Breach]:
+    """Every contract of a merged dataset: those of its sources, and those between them."""
+    breaches: list[Breach] = []
+    for source in dataset.sources:
+        there = source.dataset
+        for breach in check(there.path, render=render, progress=progress):
+            name = dataset.name_of(there.path / breach.file)
+            breaches.append(replace(breach, file=name))
+    # a file that cannot be read stops every query; it has been named
+    return breaches or list(_rules(dataset, set()))
 
 
 def _description(dataset: Dataset) -> Iterator[Breach]:

@@ -1,49 +1,35 @@
-"""Making a dataset: which shards there are, and how one of each kind is made.
+"""What a dataset is made of: its settings, its presets, its shards, and dataset.json.
 
 A shard is one unit of work and depends on (config, spec) alone: equal bytes whatever worker
-makes it, in whatever order. Its file appears whole, last, by a rename; so a finished shard is
-one whose file is there, and a re-run skips it. Scenes and images are made once
-(`generate_shard`); planning and labelling read the stored scenes and never render
-(`label_shard`).
+makes it, in whatever order.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from relevance.labels import (
-    POLICIES,
-    label_rows,
-    plan_row,
-    scene_row,
-    stored_scene,
-    timing_row,
-)
-from relevance.planner import PLANNER_VERSION, PlannerConfig, plan, warm_up
-from relevance.sampling import SceneConfig, sample_goals, sample_scene
-from relevance.scene import FAMILIES, Predicate, Scene, content_hash, scene_to_json
-from relevance.simulation import Renderer, Rendering, rejects, replay
+from relevance.labels import POLICIES
+from relevance.planner import PLANNER_VERSION, PlannerConfig
+from relevance.sampling import GoalConfig, SceneConfig
+from relevance.scene import FAMILIES, Predicate, content_hash
 from relevance.store import (
     SPLITS,
     TABLES,
     Dataset,
     DatasetError,
+    Labelling,
     differences,
+    locate,
+    sweep,
     table_schema,
 )
 
 LAYOUT = 1
 """Version of dataset.json."""
-ATTEMPTS = 1000
-"""Draws of one scene before the settings count as impossible."""
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,12 +67,16 @@ class DatasetConfig:
     """Goals drawn for each scene and predicate."""
     scene: SceneConfig = field(default_factory=SceneConfig)
     """How scenes are drawn; `family` is set by the shard."""
+    goals: GoalConfig = field(default_factory=GoalConfig)
+    """Which pairs of objects goals are asked of."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     """How goals are planned."""
     replay_share: float = 0.02
     """Share of the plans that the simulator replays, outside the test split."""
     test_replay_share: float = 1.0
     """The same for the test split."""
+    goals_seed: int | None = None
+    """Seed of the goals alone, for another goal set over the same scenes; None: `seed`."""
     policy: str = "found"
     """How relevance is read from the plans."""
 
@@ -97,6 +87,7 @@ class DatasetConfig:
                 raise ValueError(f"DatasetConfig.{name} = {found!r}: expected {expected}")
 
         require("seed", self.seed >= 0, "at least 0")
+        require("goals_seed", (self.goals_seed or 0) >= 0, "at least 0")
         require("scenes_per_shard", self.scenes_per_shard >= 1, "at least 1")
         require("goals_per_scene", self.goals_per_scene >= 1, "at least 1")
         require("replay_share", 0 <= self.replay_share <= 1, "0 to 1")
@@ -110,13 +101,28 @@ class DatasetConfig:
     @property
     def scenes_hash(self) -> str:
         """Changes with whatever changes a scene, not with how many there are."""
-        return content_hash([self.seed, _family(self.scene, FAMILIES[0])])
+        return content_hash([self.seed, settings_of_family(self.scene, FAMILIES[0])])
 
     @property
     def plans_hash(self) -> str:
         """Changes with whatever changes a plan row."""
         shares = [self.replay_share, self.test_replay_share]
-        return content_hash([self.seed, self.goals_per_scene, self.planner, shares])
+        return content_hash([self.drawn_by, self.goals_per_scene, self.goals, self.planner, shares])
+
+    @property
+    def content_hash(self) -> str:
+        """Changes with every setting."""
+        return content_hash(self)
+
+    @property
+    def drawn_by(self) -> int:
+        """Seed of the goals."""
+        return self.seed if self.goals_seed is None else self.goals_seed
+
+    @property
+    def labelling(self) -> Labelling:
+        """How this config labels with the planner of today."""
+        return Labelling(planner=PLANNER_VERSION, config=self.plans_hash, policy=self.policy)
 
     @classmethod
     def smoke(cls) -> DatasetConfig:
@@ -133,33 +139,33 @@ class DatasetConfig:
     def demo(cls) -> DatasetConfig:
         """Minutes: enough for a small network to learn from."""
         return cls(
-            train=Counts(same_plane=1300, on=1000),
-            validation=Counts(same_plane=80, on=100),
-            test=Counts(same_plane=60, on=80),
+            train=Counts(same_plane=1000, on=800),
+            validation=Counts(same_plane=60, on=80),
+            test=Counts(same_plane=40, on=60),
             scenes_per_shard=100,
-            goals_per_scene=2,
+            goals_per_scene=6,
         )
 
     @classmethod
     def laptop(cls) -> DatasetConfig:
-        """Hours: enough to come close to the best accuracy."""
+        """Under an hour on two cores: enough to come close to the best accuracy."""
         return cls(
-            train=Counts(same_plane=24_000, on=24_000),
-            validation=Counts(same_plane=500, on=500),
-            test=Counts(same_plane=500, on=500),
+            train=Counts(same_plane=10_000, on=10_000),
+            validation=Counts(same_plane=1_000, on=1_000),
+            test=Counts(same_plane=1_000, on=1_000),
             scenes_per_shard=250,
-            goals_per_scene=4,
+            goals_per_scene=6,
         )
 
     @classmethod
     def paper(cls) -> DatasetConfig:
-        """A night: about the paper's 9 million queries a predicate."""
+        """A night and more: the paper's scale, its same-plane predicates sharing their scenes."""
         return cls(
-            train=Counts(same_plane=400_000, on=400_000),
+            train=Counts(same_plane=80_000, on=160_000),
             validation=Counts(same_plane=2_000, on=2_000),
             test=Counts(same_plane=2_000, on=2_000),
-            scenes_per_shard=1_000,
-            goals_per_scene=5,
+            scenes_per_shard=500,
+            goals_per_scene=25,
         )
 
 
@@ -218,19 +224,25 @@ def work(config: DatasetConfig, finished: list[ShardSpec] | None = None) -> list
     return sorted(specs, key=lambda s: (SPLITS.index(s.split), s.shard))
 
 
-def prepare(root: str | Path, config: DatasetConfig, *, replan: bool = False) -> list[ShardSpec]:
+def prepare(
+    root: str | Path, config: DatasetConfig, *, replan: bool = False, scenes_only: bool = False
+) -> list[ShardSpec]:
     """Make or extend a dataset's dataset.json; returns every shard of it.
 
     More scenes than before append shards and renumber none. Raises DatasetError when the
     dataset there was drawn with other settings, or planned with others unless `replan`: then
-    `label_shard` makes its plans and labels anew (scenes and images stay).
+    `label_shard` makes its plans and labels anew (scenes and images stay, and so do the old
+    plans and labels, beside the new ones). With `scenes_only` the planner of today may be
+    another one than labelled the dataset.
     """
-    root = Path(root)
+    root = locate(root)
     if not (root / "dataset.json").exists():
         specs = work(config)
         Dataset.create(root, describe(config, specs))
         return specs
     there = Dataset.open(root)
+    refuse_merged(there)
+    sweep(root)
     specs = work(config, shards_of(there))
     for split in SPLITS:  # asking for fewer than there are keeps what there is
         grown = {
@@ -239,6 +251,8 @@ def prepare(root: str | Path, config: DatasetConfig, *, replan: bool = False) ->
         }
         config = replace(config, **{split: Counts(**grown)})
     wanted = describe(config, specs)
+    if scenes_only:
+        wanted["planner_version"] = there.description.get("planner_version", PLANNER_VERSION)
     ignore = _GROWING + (_PLANNING if replan else ())
     # read and written again: a setting that is younger than the dataset has its default there
     before = {**there.description, "config": _CONFIG.dump_python(load_config(there), mode="json")}
@@ -249,12 +263,13 @@ def prepare(root: str | Path, config: DatasetConfig, *, replan: bool = False) ->
             f"{root / 'dataset.json'}: {key}: the dataset was made with {found!r}, "
             f"found {expected!r}; {hint}"
         )
-    if wanted != there.description:
-        there.describe(wanted)
+    if wanted != {key: value for key, value in there.description.items() if key != "finished"}:
+        there.describe(wanted)  # and no longer finished
     return specs
 
 
 _GROWING = (
+    "finished",
     "config.train",
     "config.validation",
     "config.test",
@@ -264,6 +279,7 @@ _GROWING = (
 )
 _PLANNING = (
     "config.goals_per_scene",
+    "config.goals_seed",
     "config.planner",
     "config.policy",
     "config.replay_share",
@@ -302,176 +318,30 @@ def shards_of(dataset: Dataset) -> list[ShardSpec]:
     return _from_description(dataset, "shards", _SPECS)
 
 
-def generate_shard(
-    root: str | Path,
-    config: DatasetConfig,
-    spec: ShardSpec,
-    progress: Progress | None = None,
-) -> ShardReport:
-    """Draw and render the scenes of one shard; writes its tar, then its row file.
+def append(root: str | Path, split: str, *, same_plane: int = 0, on: int = 0) -> list[ShardSpec]:
+    """Add that many scenes to a split, as further shards with the next indices; all the shards.
 
-    Skips a finished shard. Raises DatasetError when the settings admit no scene.
+    What is there is neither renumbered nor rewritten. Raises DatasetError for an unknown split.
     """
-    dataset = Dataset.open(root)
-    started = time.perf_counter()
-    where: dict[str, Any] = {"split": spec.split, "shard": spec.shard}
-    if dataset.has("scenes", **where) and dataset.images_path(**where).is_file():
-        return ShardReport(spec=spec, predicate=None, skipped=True, rows=spec.count)
-    rows: list[dict[str, Any]] = []
-    config_hash = config.scenes_hash
-
-    def pictures(renderer: Renderer) -> Iterator[tuple[str, Rendering, str]]:
-        for index in range(spec.first, spec.first + spec.count):
-            scene, rendering, attempt = draw(config, spec, index, renderer)
-            rows.append(
-                scene_row(
-                    scene,
-                    rendering,
-                    split=spec.split,
-                    shard=spec.shard,
-                    family=spec.family,
-                    seed=config.seed,
-                    index=index,
-                    attempt=attempt,
-                    config_hash=config_hash,
-                )
-            )
-            yield scene.id, rendering, scene_to_json(scene)
-            if progress:
-                progress(len(rows), spec.count)
-
-    with Renderer() as renderer:
-        made = dataset.write_images(samples=pictures(renderer), **where)
-    dataset.write_rows("scenes", rows, made_by=made, **where)
-    seconds = time.perf_counter() - started
-    return ShardReport(spec=spec, predicate=None, skipped=False, rows=len(rows), seconds=seconds)
+    if split not in SPLITS:
+        raise DatasetError(f"split {split!r}: expected one of {', '.join(SPLITS)}")
+    if same_plane < 0 or on < 0 or same_plane + on == 0:
+        raise DatasetError(f"append {same_plane} and {on} scenes: expected at least 1 in all")
+    config = load_config(Dataset.open(root))
+    now = config.counts(split)
+    more = Counts(same_plane=now.same_plane + same_plane, on=now.on + on)
+    return prepare(root, replace(config, **{split: more}), scenes_only=True)
 
 
-def draw(
-    config: DatasetConfig, spec: ShardSpec, index: int, renderer: Renderer
-) -> tuple[Scene, Rendering, int]:
-    """Scene `index` of a shard with its rendering, and how many draws were rejected before it."""
-    settings = _family(config.scene, spec.family)
-    reason = "no room"
-    for attempt in range(ATTEMPTS):
-        scene = sample_scene(
-            settings, seed=config.seed, index=index, split=spec.split, attempt=attempt
-        )
-        if scene is None:
-            continue
-        rendering = renderer.render(scene)
-        reason = rejects(rendering)
-        if reason is None:
-            return scene, rendering, attempt
-    raise DatasetError(
-        f"scene {index} of {spec.split}: no draw in {ATTEMPTS} was accepted (last: {reason}); "
-        "expected scene settings that leave room for the boxes"
-    )
+def refuse_merged(dataset: Dataset) -> None:
+    """Raises DatasetError for a merged dataset, whose shards are made where they are."""
+    if dataset.sources:
+        names = ", ".join(str(source.dataset.path) for source in dataset.sources)
+        raise DatasetError(f"{dataset.path}: is merged by reference; make shards in {names}")
 
 
-def label_shard(
-    root: str | Path,
-    config: DatasetConfig,
-    spec: ShardSpec,
-    predicate: Predicate | str,
-    progress: Progress | None = None,
-) -> ShardReport:
-    """Plan the goals of one shard's stored scenes; writes timings, plans, then labels.
-
-    Skips what was made with this config, planner version and policy; makes anything else
-    anew. Raises DatasetError when the scenes are not there, ValueError for a predicate of
-    another family.
-    """
-    predicate = Predicate(predicate)
-    if predicate not in spec.predicates:
-        raise ValueError(f"{predicate.value}: expected a predicate of family {spec.family}")
-    dataset = Dataset.open(root)
-    started = time.perf_counter()
-    scenes = {"split": spec.split, "shard": spec.shard}
-    where: dict[str, Any] = {**scenes, "predicate": predicate.value}
-    plans_by = {"config": config.plans_hash, "planner": PLANNER_VERSION}
-    labels_by = {**plans_by, "policy": config.policy}
-    plans: list[dict[str, Any]] = []
-    planned = _made_by(dataset, "plans", plans_by, where)
-    skipped = planned and _made_by(dataset, "labels", labels_by, where)
-    if planned:
-        plans = dataset.read_rows("plans", **where)
-    if not skipped:
-        if not dataset.has("scenes", **scenes):
-            file = dataset.shard_path("scenes", **scenes)
-            raise DatasetError(f"{file}: does not exist, expected its scenes to be made first")
-        rows = dataset.read_rows("scenes", **scenes)
-        if not planned:
-            plans, timings = _plans(config, predicate, rows, progress)
-            # Plans after timings and labels last: a finished plan file is never planned again.
-            dataset.write_rows("timings", timings, made_by=plans_by, **where)
-            dataset.write_rows("plans", plans, made_by=plans_by, **where)
-        by_id = {row["scene_id"]: row for row in rows}
-        labels = [
-            label
-            for row in plans
-            for label in label_rows(by_id[row["scene_id"]], row, config.policy)
-        ]
-        dataset.write_rows("labels", labels, made_by=labels_by, **where)
-    return ShardReport(
-        spec=spec,
-        predicate=predicate.value,
-        skipped=skipped,
-        rows=len(plans),
-        holds=sum(row["holds"] for row in plans),
-        seconds=time.perf_counter() - started,
-    )
-
-
-def _plans(
-    config: DatasetConfig,
-    predicate: Predicate,
-    rows: list[dict[str, Any]],
-    progress: Progress | None,
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    plans: list[dict[str, Any]] = []
-    timings: list[dict[str, Any]] = []
-    config_hash = config.plans_hash
-    warm_up()
-    for done, row in enumerate(rows, 1):
-        scene = stored_scene(row)
-        share = config.test_replay_share if row["split"] == "test" else config.replay_share
-        for goal in sample_goals(scene, predicate, config.goals_per_scene, seed=config.seed):
-            result = plan(scene, goal, config=config.planner)
-            verdict, seconds = None, None
-            if result.status == "solved" and _chosen(scene.id, str(goal), share):
-                started = time.perf_counter()
-                verdict = replay(scene, goal, result.phases)
-                seconds = time.perf_counter() - started
-            plans.append(
-                plan_row(
-                    scene,
-                    row["split"],
-                    row["shard"],
-                    result,
-                    verdict,
-                    config_hash=config_hash,
-                )
-            )
-            timings.append(timing_row(plans[-1], result, seconds_replay=seconds))
-        if progress:
-            progress(done, len(rows))
-    return plans, timings
-
-
-def _chosen(scene_id: str, goal: str, share: float) -> bool:
-    """Whether a plan is among the replayed share: drawn by its task, so that order is nothing."""
-    return int(content_hash(["replay", scene_id, goal])[:8], 16) < share * 2**32
-
-
-def _made_by(dataset: Dataset, table: str, expected: dict[str, str], where: dict[str, Any]) -> bool:
-    if not dataset.has(table, **where):
-        return False
-    found = dataset.metadata(dataset.shard_path(table, **where))
-    return all(found.get(key) == value for key, value in expected.items())
-
-
-def _family(settings: SceneConfig, family: str) -> SceneConfig:
+def settings_of_family(settings: SceneConfig, family: str) -> SceneConfig:
+    """Scene settings for a family."""
     return replace(settings, family=family)
 
 

@@ -1,0 +1,31 @@
+"""Measurements of the planner on fresh random tasks: nothing here prints, the command line does.
+
+Each part is one function that does the work and returns a `Measured`: rows for a file, tables
+for a person, and what its plots need. Times are CPU seconds of this process (all its threads)
+unless a name says wall; intervals are 95%: bootstrap for times, Wilson for shares.
+"""
+
+from relevance.benchmarks.against import measure_against
+from relevance.benchmarks.completeness import measure_completeness
+from relevance.benchmarks.planned import measure_planning
+from relevance.benchmarks.plots import save
+from relevance.benchmarks.searches import MAX_EDGE, SIZES, measure_scaling, measure_searches
+from relevance.benchmarks.stability import measure_stability
+from relevance.benchmarks.summary import Measured
+from relevance.benchmarks.tasks import BenchmarkError, Task, draw
+
+__all__ = [
+    "MAX_EDGE",
+    "SIZES",
+    "BenchmarkError",
+    "Measured",
+    "Task",
+    "draw",
+    "measure_against",
+    "measure_completeness",
+    "measure_planning",
+    "measure_scaling",
+    "measure_searches",
+    "measure_stability",
+    "save",
+]

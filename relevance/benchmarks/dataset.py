@@ -1,0 +1,318 @@
+"""How fast datasets are made, read and asked, and what they survive: `relevance bench dataset`.
+
+Rates are of this machine as it is now; the tables say how many processor seconds and how many
+wall seconds they rest on.
+"""
+
+from __future__ import annotations
+
+import io
+import multiprocessing
+import tarfile
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from relevance.benchmarks.crashes import Trial, disturb
+from relevance.benchmarks.summary import Measured, Progress
+from relevance.generation import (
+    Counts,
+    DatasetConfig,
+    ShardSpec,
+    finish,
+    generate_shard,
+    label_shard,
+    prepare,
+)
+from relevance.statistics import Table
+from relevance.store import Dataset, compact, decode, sql, synthetic_labels
+
+SCENES_A_SECOND = 60.0
+"""Wanted of one core, without planning, 320 x 192."""
+GOALS_A_SECOND = 70.0
+"""Wanted of one core."""
+TWO_OVER_ONE = 1.85
+"""Wanted of two processes over one."""
+READING_SHARE = 0.9
+"""Wanted of the reader over decoding alone."""
+QUERY_SECONDS = 1.0
+"""Wanted of the label balance of 50 million rows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rate:
+    """One measured rate and what was wanted."""
+
+    what: str
+    value: float
+    unit: str
+    wanted: float | None
+    count: int
+    seconds: float
+    """Wall."""
+    seconds_cpu: float | None
+
+    @property
+    def reached(self) -> bool | None:
+        """Whether it is what was wanted; seconds should be fewer, everything else more."""
+        if self.wanted is None:
+            return None
+        return self.value <= self.wanted if self.unit == "s" else self.value >= self.wanted
+
+
+def measure_making(
+    folder: Path, *, scenes: int, seed: int, workers: int = 2, progress: Progress | None = None
+) -> Measured:
+    """Scenes and labelled goals a second of one core, and of several processes over one.
+
+    Each process makes a small shard first, so that nothing is compiled or loaded in the time
+    that counts. Settings are those of the laptop preset.
+    """
+    config = replace(
+        DatasetConfig.laptop(),
+        seed=seed,
+        train=Counts(same_plane=scenes, on=scenes),
+        validation=Counts(),
+        test=Counts(),
+        scenes_per_shard=max(1, scenes // (4 * workers)),
+    )
+    rates: list[Rate] = []
+    for processes in dict.fromkeys((1, workers)):
+        root = folder / f"made-by-{processes}"
+        with _pool(processes, folder / f"warm-{processes}", config) as pool:
+            specs = prepare(root, config)
+            for stage, jobs in (
+                ("scenes", [(root, config, spec, None) for spec in specs]),
+                ("goals", [(root, config, s, p.value) for s in specs for p in s.predicates]),
+            ):
+                start = time.perf_counter()
+                made: list[tuple[int, float]] = []
+                for done, result in enumerate(pool.map(_make, jobs), 1):
+                    made.append(result)
+                    if progress:
+                        progress(done, len(jobs))
+                wall = time.perf_counter() - start
+                rows, cpu = sum(n for n, _ in made), sum(seconds for _, seconds in made)
+                wanted = {"scenes": SCENES_A_SECOND, "goals": GOALS_A_SECOND}[stage]
+                rates.append(
+                    Rate(
+                        what=f"{stage}, {processes} process" + "es" * (processes > 1),
+                        value=rows / (cpu if processes == 1 else wall),
+                        unit=f"{stage} a core second" if processes == 1 else f"{stage} a second",
+                        wanted=wanted if processes == 1 else None,
+                        count=rows,
+                        seconds=wall,
+                        seconds_cpu=cpu,
+                    )
+                )
+        finish(root)
+    if workers > 1:
+        for stage, one, several in zip(("scenes", "goals"), rates[:2], rates[2:], strict=True):
+            rates.append(
+                Rate(
+                    what=f"{stage}, {workers} processes over 1",
+                    value=one.seconds / several.seconds,
+                    unit="times",
+                    wanted=TWO_OVER_ONE if workers == 2 else None,
+                    count=one.count,
+                    seconds=one.seconds + several.seconds,
+                    seconds_cpu=None,
+                )
+            )
+    return _measured("making", "Making", rates)
+
+
+def measure_reading(root: str | Path, *, split: str = "train", rounds: int = 3) -> Measured:
+    """The trainers' reader against decoding alone, scenes a processor second, one process.
+
+    Both see the same scenes: decoding alone has their bytes in memory already; the reader opens
+    shards, checks their hashes, takes samples apart, shuffles and decodes. The best of a few
+    rounds each, taken in turns.
+    """
+    dataset = Dataset.open(root)
+    items = [item for shard in dataset.shards(split) for item in _members(dataset, split, shard)]
+    alone, reader = [], []
+    for _ in range(rounds):
+        start = time.process_time()
+        for item in items:
+            decode(item)
+        alone.append(time.process_time() - start)
+        start = time.process_time()
+        read = sum(1 for _ in dataset.samples(split, shuffle_seed=0))
+        reader.append(time.process_time() - start)
+        assert read == len(items), f"expected {len(items)} samples, read {read}"
+    unit = "scenes a core second"
+    rates = [
+        _rate("decoding alone", len(items), min(alone), unit=unit),
+        _rate("the trainers' reader", len(items), min(reader), unit=unit),
+        Rate(
+            what="reader over decoding",
+            value=min(alone) / min(reader),
+            unit="times",
+            wanted=READING_SHARE,
+            count=len(items),
+            seconds=sum(alone) + sum(reader),
+            seconds_cpu=None,
+        ),
+    ]
+    return _measured("reading", "Reading", rates)
+
+
+def measure_queries(
+    folder: Path, *, rows: int, shards: int, rounds: int = 3, progress: Progress | None = None
+) -> Measured:
+    """The label balance over synthetic rows, from small shards and from gathered files.
+
+    Times include opening the dataset and making its views, as `relevance sql` does.
+    """
+    root = folder / "synthetic"
+    start = time.perf_counter()
+    dataset = synthetic_labels(root, rows, shards=shards, progress=progress)
+    rates = [_rate("rows written", rows, time.perf_counter() - start, unit="rows a second")]
+
+    def ask() -> tuple[float, Any]:
+        found, seconds = None, []
+        for _ in range(rounds):
+            start = time.perf_counter()
+            found = sql(root, "from label_balance")
+            seconds.append(time.perf_counter() - start)
+        return min(seconds), found
+
+    seconds, before = ask()
+    files = len(dataset.files("labels"))
+    rates.append(_took(f"label balance, {files} shards", rows, seconds, None))
+    start = time.perf_counter()
+    compact(dataset)
+    rates.append(_rate("rows gathered", rows, time.perf_counter() - start, unit="rows a second"))
+    seconds, after = ask()
+    assert after == before, "gathered rows answer as the shards do"
+    wanted = QUERY_SECONDS if rows >= 50_000_000 else None
+    rates.append(_took("label balance, gathered", rows, seconds, wanted))
+    return _measured("queries", "Queries", rates)
+
+
+def measure_crashes(
+    folder: Path, *, kills: int, seed: int, flows: bool = True, progress: Progress | None = None
+) -> Measured:
+    """Kill, fill and break that often; see `disturb`, which raises when a byte is lost."""
+    flags = {
+        "train.same_plane": 8,
+        "train.on": 16,
+        "validation.same_plane": 0,
+        "validation.on": 0,
+        "test.same_plane": 0,
+        "test.on": 4,
+        "scenes_per_shard": 2,
+        "goals_per_scene": 1,
+    }
+    trials = disturb(folder, flags, kills=kills, seed=seed, flows=flows, progress=progress)
+    return Measured(name="crashes", rows=tuple(trials), tables=(_crash_table(trials),))
+
+
+def _crash_table(trials: Sequence[Trial]) -> Table:
+    kinds = Counter(trial.what for trial in trials)
+    rows = [
+        (
+            what,
+            count,
+            sum(t.wrong for t in trials if t.what == what),
+            sum(t.left for t in trials if t.what == what),
+            sum(t.recovered for t in trials if t.what == what),
+        )
+        for what, count in sorted(kinds.items())
+    ]
+    rows.append(
+        (
+            "all",
+            len(trials),
+            sum(trial.wrong for trial in trials),
+            sum(trial.left for trial in trials),
+            sum(trial.recovered for trial in trials),
+        )
+    )
+    return Table(
+        name="crashes",
+        title="Disturbed, then completed to the bytes of an undisturbed run",
+        columns=("what", "times", "wrong files seen", "processes left", "recovered or named"),
+        rows=tuple(rows),
+    )
+
+
+def _make(job: tuple[Path, DatasetConfig, ShardSpec, str | None]) -> tuple[int, float]:
+    """Rows and processor seconds of one unit of work."""
+    root, config, spec, predicate = job
+    start = time.process_time()
+    if predicate is None:
+        report = generate_shard(root, config, spec)
+    else:
+        report = label_shard(root, config, spec, predicate)
+    return report.rows, time.process_time() - start
+
+
+def _warm(job: tuple[Path, DatasetConfig]) -> None:
+    folder, config = job
+    root = folder / multiprocessing.current_process().name
+    few = replace(config, train=Counts(same_plane=1, on=1), scenes_per_shard=1)
+    for spec in prepare(root, few):
+        generate_shard(root, few, spec)
+        for predicate in spec.predicates:
+            label_shard(root, few, spec, predicate)
+    time.sleep(1.0)  # so that no process takes the work of another
+
+
+def _pool(processes: int, folder: Path, config: DatasetConfig) -> ProcessPoolExecutor:
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+    list(pool.map(_warm, [(folder, config)] * processes))
+    return pool
+
+
+def _members(dataset: Dataset, split: str, shard: int) -> list[Mapping[str, Any]]:
+    """Undecoded samples of a shard, as the reader has them just before it decodes."""
+    found: dict[str, dict[str, Any]] = {}
+    content = dataset.read_images(split, shard)
+    with tarfile.open(fileobj=io.BytesIO(content)) as tar:
+        for member in tar:
+            key, _, name = member.name.partition(".")
+            stream = tar.extractfile(member)
+            assert stream is not None, "members of an image tar are files"
+            sample = found.setdefault(key, {"__key__": key, "__url__": f"shard {shard}"})
+            sample[name] = stream.read()
+    return list(found.values())
+
+
+def _rate(what: str, count: int, seconds: float, unit: str) -> Rate:
+    return Rate(
+        what=what,
+        value=count / seconds,
+        unit=unit,
+        wanted=None,
+        count=count,
+        seconds=seconds,
+        seconds_cpu=None,
+    )
+
+
+def _took(what: str, count: int, seconds: float, wanted: float | None) -> Rate:
+    return Rate(
+        what=what,
+        value=seconds,
+        unit="s",
+        wanted=wanted,
+        count=count,
+        seconds=seconds,
+        seconds_cpu=None,
+    )
+
+
+def _measured(name: str, title: str, rates: Sequence[Rate]) -> Measured:
+    columns = ("what", "value", "unit", "wanted", "reached", "count", "wall s", "core s")
+    rows = tuple(
+        (r.what, r.value, r.unit, r.wanted, r.reached, r.count, r.seconds, r.seconds_cpu)
+        for r in rates
+    )
+    table = Table(name=name, title=title, columns=columns, rows=rows)
+    return Measured(name=name, rows=tuple(rates), tables=(table,))

@@ -1,0 +1,120 @@
+"""Merging datasets by reference: no file of theirs is copied, renamed or rewritten."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from relevance.generation.settings import (
+    Counts,
+    ShardSpec,
+    describe,
+    load_config,
+    shards_of,
+)
+from relevance.store import SPLITS, Dataset, DatasetError, absolute, is_remote
+
+
+def merge(sources: Sequence[str | Path], into: str | Path) -> Dataset:
+    """Make a dataset that holds the shards of others by reference; returns it.
+
+    Its shards are numbered anew, one source after the other; every view, reader and trainer
+    works on it. Labels that a source gets later, under another policy say, are seen here too;
+    shards that it gets later are not. Raises DatasetError for less than two sources, tables of
+    different versions, labels made in different ways, or a scene that is there twice.
+    """
+    target = absolute(into)
+    datasets = [_flat(path) for path in sources]
+    datasets = [dataset for several in datasets for dataset in several]
+    if len(datasets) < 2:
+        raise DatasetError(f"{target}: expected at least two datasets to merge")
+    if (target / "dataset.json").is_file():
+        raise DatasetError(f"{target}: is a dataset already, expected another folder")
+    head, *rest = datasets
+    for other in rest:
+        _same(head, other)
+    _distinct(datasets)
+    first: dict[str, int] = dict.fromkeys(SPLITS, 0)
+    entries: list[dict[str, Any]] = []
+    specs: list[ShardSpec] = []
+    scenes: dict[str, int] = dict.fromkeys(SPLITS, 0)
+    for dataset in datasets:
+        mine = shards_of(dataset)
+        count = {split: sum(spec.split == split for spec in mine) for split in SPLITS}
+        entries.append({"path": _way(target, dataset.path), "first": dict(first), "count": count})
+        for spec in mine:
+            specs.append(
+                replace(
+                    spec,
+                    shard=first[spec.split] + spec.shard,
+                    first=scenes[spec.split] + spec.first,
+                )
+            )
+        for split in SPLITS:
+            first[split] += count[split]
+            scenes[split] += sum(spec.count for spec in mine if spec.split == split)
+    config = load_config(head)
+    for split in SPLITS:
+        counts = [load_config(dataset).counts(split) for dataset in datasets]
+        same_plane, on = sum(c.same_plane for c in counts), sum(c.on for c in counts)
+        config = replace(config, **{split: Counts(same_plane=same_plane, on=on)})
+    description = describe(config, specs)
+    for key in ("planner_version", "tables"):
+        description[key] = head.description.get(key)
+    # Seeds differ, and so do the hashes of the settings: each source is held to its own.
+    description["hashes"] = {}
+    description["sources"] = entries
+    finished = [d.description.get("finished", []) for d in datasets]
+    description["finished"] = [
+        stage for stage in finished[0] if all(stage in other for other in finished)
+    ]
+    return Dataset.create(target, description)
+
+
+def _flat(path: str | Path) -> list[Dataset]:
+    """A dataset, or the sources of a merged one."""
+    dataset = Dataset.open(absolute(path))
+    if not dataset.sources:
+        return [dataset]
+    return [item for source in dataset.sources for item in _flat(source.dataset.path)]
+
+
+def _way(target: Path, source: Path) -> str:
+    """A way to a source that goes along when both are moved together."""
+    if is_remote(source) or is_remote(target):
+        return str(source)
+    return os.path.relpath(source, target)
+
+
+def _same(head: Dataset, other: Dataset) -> None:
+    """Raises DatasetError unless two datasets have equal schemas and ways of labelling."""
+    for key in ("layout", "tables", "planner_version"):
+        found, expected = other.description.get(key), head.description.get(key)
+        if found != expected:
+            raise DatasetError(
+                f"{other.path}: {key}: expected {expected} as in {head.path}, found {found}"
+            )
+    found, expected = load_config(other).policy, load_config(head).policy
+    if found != expected:
+        raise DatasetError(
+            f"{other.path}: policy: expected {expected} as in {head.path}, found {found}"
+        )
+
+
+def _distinct(datasets: Sequence[Dataset]) -> None:
+    """Raises DatasetError that names a scene which is there twice."""
+    seen: dict[str, tuple[Dataset, str]] = {}
+    for dataset in datasets:
+        for split in SPLITS:
+            for file in dataset.files("scenes", split=split):
+                for scene_id in dataset.read_file(file)["scene_id"].to_pylist():
+                    if scene_id in seen:
+                        there, other = seen[scene_id]
+                        raise DatasetError(
+                            f"{dataset.path}: scene {scene_id} of {split}: expected in one "
+                            f"dataset only, found in {other} of {there.path} too"
+                        )
+                    seen[scene_id] = dataset, split

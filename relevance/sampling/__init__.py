@@ -1,0 +1,34 @@
+"""Random scenes and goals, each a pure function of its counters.
+
+Every draw comes from a Philox generator whose counter is (split, family, index, attempt), so
+scene 17 is the same scene whoever makes it, in whatever order, with whatever number of
+workers. Nothing here knows the renderer or the planner: a scene is drawn so that the camera
+sees every box and the arm can reach it from above, and whether it is *useful* is decided later.
+
+Goal regions that are free need no extra action, so uniformly scattered boxes give almost no
+relevant objects (2 to 4% of the queries). Scenes are therefore dense where it matters: boxes
+stand squarely in the goal regions of others (`crowding`), and in `on` scenes many of them carry
+another (`stacking`). Which of the valid goals are asked follows stated odds (`GoalConfig`) that
+look at the stacks, never at plans. With the defaults about 14% (same-plane) and 30% (`on`) of
+the queries are relevant, as in the paper. All of it is configuration, hence in every row's hash.
+"""
+
+from relevance.sampling.colors import lab
+from relevance.sampling.fitting import GRASPABLE_EDGE
+from relevance.sampling.goals import GoalConfig, sample_goals
+from relevance.sampling.projection import camera_up, project, vertices
+from relevance.sampling.randomisation import Randomisation
+from relevance.sampling.scenes import SceneConfig, sample_scene
+
+__all__ = [
+    "GRASPABLE_EDGE",
+    "GoalConfig",
+    "Randomisation",
+    "SceneConfig",
+    "camera_up",
+    "lab",
+    "project",
+    "sample_goals",
+    "sample_scene",
+    "vertices",
+]

@@ -1,0 +1,109 @@
+"""Colours that can be told apart, and a word for each.
+
+A colour is RGB in 0..1 as it stands in an image file, that is sRGB: the renderer multiplies it
+by the light and writes the result.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+Color = tuple[float, float, float]
+
+FEW = 11
+"""Up to this many boxes keep the full distance of colours."""
+MOST = 31
+"""Most boxes in one scene."""
+
+COLOR_NAMES: dict[str, tuple[float, float, float]] = {
+    "red": (0.85, 0.1, 0.1),
+    "maroon": (0.45, 0.1, 0.12),
+    "orange": (0.95, 0.5, 0.1),
+    "brown": (0.5, 0.3, 0.12),
+    "yellow": (0.95, 0.9, 0.15),
+    "olive": (0.5, 0.5, 0.12),
+    "lime": (0.6, 0.95, 0.2),
+    "green": (0.15, 0.75, 0.2),
+    "forest": (0.12, 0.42, 0.15),
+    "mint": (0.35, 0.95, 0.65),
+    "cyan": (0.2, 0.9, 0.95),
+    "teal": (0.1, 0.5, 0.5),
+    "azure": (0.25, 0.6, 0.95),
+    "blue": (0.12, 0.2, 0.9),
+    "navy": (0.1, 0.12, 0.45),
+    "violet": (0.5, 0.35, 0.95),
+    "purple": (0.5, 0.1, 0.75),
+    "plum": (0.42, 0.12, 0.42),
+    "magenta": (0.95, 0.15, 0.85),
+    "pink": (0.95, 0.5, 0.75),
+    "crimson": (0.85, 0.1, 0.45),
+    "rust": (0.7, 0.3, 0.05),
+    "gold": (0.8, 0.65, 0.05),
+    "salmon": (0.95, 0.45, 0.4),
+    "sand": (0.75, 0.65, 0.3),
+    "moss": (0.35, 0.55, 0.1),
+    "emerald": (0.05, 0.6, 0.4),
+    "turquoise": (0.2, 0.8, 0.7),
+    "steel": (0.25, 0.45, 0.65),
+    "cobalt": (0.1, 0.35, 0.75),
+    "indigo": (0.3, 0.1, 0.6),
+    "orchid": (0.75, 0.3, 0.85),
+    "rose": (0.75, 0.25, 0.4),
+}
+
+
+def draw_colors(
+    rng: np.random.Generator,
+    count: int,
+    avoid: list[Color],
+    *,
+    distance: float,
+    perceptual: bool = False,
+) -> list[tuple[str, Color]] | None:
+    """Distinct saturated colours, each named after the nearest colour word not yet taken.
+
+    distance: the least to each other and to those to avoid, in RGB (0..1), or when `perceptual`
+    as CIE 1976 Delta E. With n > 11 colours it shrinks by (11 / n)^(1/2). None when they could
+    not be found.
+    """
+    space = lab if perceptual else np.asarray
+    words, anchors = list(COLOR_NAMES), np.array(list(COLOR_NAMES.values()))
+    taken = np.array([space(np.array(color)) for color in avoid])
+    least = (distance * min(1.0, math.sqrt(FEW / count))) ** 2
+    named: dict[str, Color] = {}
+    for _ in range(200 * count):
+        color = from_hsv(rng.uniform(0, 1), rng.uniform(0.55, 1), rng.uniform(0.4, 1))
+        place = space(color)
+        if ((taken - place) ** 2).sum(axis=1).min() < least:
+            continue
+        nearest = np.argsort(((anchors - color) ** 2).sum(axis=1), kind="stable")
+        name = next(words[i] for i in nearest if words[i] not in named)
+        taken = np.vstack([taken, place])
+        named[name] = (float(color[0]), float(color[1]), float(color[2]))
+        if len(named) == count:
+            return list(named.items())
+    return None
+
+
+def lab(color: np.ndarray) -> np.ndarray:
+    """CIELAB (..., 3) of sRGB (..., 3) in 0..1, white point D65; distances in it are Delta E."""
+    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+    relative = linear @ _TO_XYZ.T / _TO_XYZ.sum(axis=1)
+    f = np.where(relative > _KNEE**3, np.cbrt(relative), relative / (3 * _KNEE**2) + 4 / 29)
+    x, y, z = f[..., 0], f[..., 1], f[..., 2]
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
+
+
+_KNEE = 6 / 29
+_TO_XYZ = np.array(  # IEC 61966-2-1
+    [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+)
+
+
+def from_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
+    """RGB (3,) of a hue, saturation and value in 0..1, rounded to 0.001."""
+    k = (np.array([5.0, 3.0, 1.0]) + 6 * hue) % 6
+    shade = np.clip(np.minimum(k, 4 - k), 0, 1)
+    return np.round(value * (1 - saturation * shade), 3)

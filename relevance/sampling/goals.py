@@ -1,0 +1,70 @@
+"""Which goals a scene is asked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from relevance.sampling.counters import generator
+from relevance.sampling.fitting import GRASPABLE_EDGE
+from relevance.scene import Goal, Predicate, Scene, goal_holds
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GoalConfig:
+    """The odds of goals; they look at who carries whom, never at plans."""
+
+    carrying_reference: float = 0.95
+    """Share of `on` goals whose reference carries a box already, where the scene has one."""
+    carrying_subject: float = 4.0
+    """How likely a box that carries another is drawn as subject, relative to one that does not."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.carrying_reference < 1:
+            found = self.carrying_reference
+            raise ValueError(f"GoalConfig.carrying_reference = {found!r}: expected in (0, 1)")
+        if not self.carrying_subject > 0:
+            found = self.carrying_subject
+            raise ValueError(f"GoalConfig.carrying_subject = {found!r}: expected over 0")
+
+
+def sample_goals(
+    scene: Scene,
+    predicate: Predicate,
+    count: int,
+    *,
+    seed: int,
+    config: GoalConfig = GoalConfig(),
+) -> tuple[Goal, ...]:
+    """Draw up to `count` distinct goals that are not true yet and whose subject can be grasped.
+
+    Depends on (seed, scene.id, predicate, config) and the scene's boxes alone; asking for more
+    goals keeps the earlier ones. Fewer than `count` come back when the scene has no more.
+    """
+    carrying = {box.on for box in scene.objects if box.on is not None}
+    goals: list[Goal] = []
+    weights: list[float] = []
+    on_carrier: list[bool] = []
+    for subject in scene.objects:
+        if min(subject.size[:2]) > GRASPABLE_EDGE:
+            continue
+        for reference in scene.objects:
+            # A reference that stands on its own subject would be lifted away with it.
+            if reference.name == subject.name or reference.on == subject.name:
+                continue
+            goal = Goal(predicate=predicate, subject=subject.name, reference=reference.name)
+            if goal_holds(scene.objects, goal):
+                continue
+            goals.append(goal)
+            weights.append(config.carrying_subject if subject.name in carrying else 1.0)
+            on_carrier.append(predicate is Predicate.ON and reference.name in carrying)
+    weight = np.array(weights)
+    chosen = np.array(on_carrier, dtype=bool)
+    inside, outside = weight[chosen].sum(), weight[~chosen].sum()
+    if inside > 0 and outside > 0:
+        odds = config.carrying_reference / (1 - config.carrying_reference)
+        weight[chosen] *= odds * outside / inside
+    # Exponential keys: the order of a weighted draw without replacement.
+    keys = generator(seed, f"{scene.id}/{predicate.value}").exponential(size=len(goals)) / weight
+    return tuple(goals[i] for i in np.argsort(keys, kind="stable")[:count])

@@ -1,0 +1,333 @@
+"""Random scenes, each a pure function of its counters (see the package's docstring)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from relevance.sampling.colors import MOST, Color, draw_colors
+from relevance.sampling.counters import generator
+from relevance.sampling.fitting import GRASPABLE_EDGE, Standing
+from relevance.sampling.randomisation import (
+    Randomisation,
+    draw_camera,
+    draw_light,
+    draw_table,
+)
+from relevance.scene import (
+    FAMILIES,
+    GAP,
+    Box,
+    Camera,
+    Light,
+    Robot,
+    Scene,
+    Table,
+    content_hash,
+)
+
+NEAR = 0.026
+"""Narrowest gap of a crowded box to its neighbour, m. A finger beside a box takes 34 mm with its
+clearance, so some boxes must leave before their neighbour can be taken."""
+CENTRED = 0.2
+"""How far off a neighbour's middle a crowded box may stand, as a share of its half extent."""
+BROADSIDE = 0.15
+"""How far a crowded box may be turned out of line with its neighbour's sides, rad."""
+COMMON_RADIUS = 0.0275
+"""Half the shorter footprint edge of a common subject, m."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneConfig:
+    """What scenes are drawn; raises ValueError that names the field on impossible settings."""
+
+    family: str = "same-plane"
+    """`same-plane`: all boxes on the table. `on`: one box more, and some on top of others."""
+    min_objects: int = 3
+    """Fewest boxes (the `on` family adds one)."""
+    max_objects: int = 10
+    """Most boxes (the `on` family adds one)."""
+    crowding: float = 1.0
+    """Probability that a box is drawn into a goal region of an earlier one (same-plane)."""
+    crowding_on: float = 0.0
+    """The same for the boxes on the table of an `on` scene."""
+    choices: int = 3
+    """Free places of which a crowded box takes the one that closes most goal regions."""
+    stacking: float = 0.7
+    """Probability that a box of an `on` scene stands on another (one always does; stacks are
+    two high, so at most every second box)."""
+    stack_height: float = 0.15
+    """Tallest stack, m; taller ones hide what is behind them."""
+    obstacle_share: float = 0.0
+    """Share of boxes with both footprint edges over 7 cm, which the hand cannot take."""
+    min_edge: float = 0.04
+    """Shortest edge, m."""
+    max_edge: float = 0.12
+    """Longest edge, m."""
+    max_height: float = 0.12
+    """Tallest box, m."""
+    spacing: float = 0.005
+    """Least distance between boxes, m."""
+    reach: tuple[float, float] = (0.30, 0.72)
+    """Distance of a box's centre from the robot's base, from and to, m."""
+    table_margin: float = 0.02
+    """Least distance of a footprint from the table's edge, m."""
+    image_margin: float = 2.0
+    """Least distance of a box's projection from the image border, pixels."""
+    visible: float = 0.35
+    """Least share of what the camera sees of a box alone that shows among the others, judged by
+    rays to its faces; the rendering has the last word."""
+    color_distance: float = 0.3
+    """Least RGB distance of two boxes, and of a box and the table; with n > 11 boxes it
+    shrinks by (11 / n)^(1/2)."""
+    tries: int = 100
+    """Positions tried for one box before the draw counts as failed."""
+    randomisation: Randomisation | None = None
+    """Light, table, camera and colours that differ from scene to scene; None: the paper's
+    setting, all as below."""
+    table: Table = field(default_factory=Table)
+    camera: Camera = field(default_factory=Camera)
+    light: Light = field(default_factory=Light)
+    robot: Robot = field(default_factory=Robot)
+
+    def __post_init__(self) -> None:
+        def require(name: str, good: bool, expected: str) -> None:
+            if not good:
+                value = getattr(self, name)
+                raise ValueError(f"SceneConfig.{name} = {value!r}: expected {expected}")
+
+        require("family", self.family in FAMILIES, f"one of {', '.join(FAMILIES)}")
+        require("min_objects", self.min_objects >= 2, "at least 2")
+        require("max_objects", self.min_objects <= self.max_objects, "at least min_objects")
+        require("max_objects", self.max_objects < MOST, f"under {MOST} (distinct colours)")
+        require("crowding", 0 <= self.crowding <= 1, "a probability")
+        require("crowding_on", 0 <= self.crowding_on <= 1, "a probability")
+        require("choices", self.choices >= 1, "at least 1")
+        require("stacking", 0 <= self.stacking <= 1, "a probability")
+        require("obstacle_share", 0 <= self.obstacle_share <= 1, "a probability")
+        require("min_edge", 0 < self.min_edge <= GRASPABLE_EDGE, f"in (0, {GRASPABLE_EDGE}]")
+        require("max_edge", self.max_edge > GRASPABLE_EDGE, f"over {GRASPABLE_EDGE}")
+        require("max_height", self.min_edge <= self.max_height, "at least min_edge")
+        require("stack_height", 2 * self.min_edge < self.stack_height, "over twice min_edge")
+        require("spacing", self.spacing >= 0, "at least 0")
+        require("reach", 0 <= self.reach[0] < self.reach[1], "0 <= from < to")
+        require("table_margin", self.table_margin >= 0, "at least 0")
+        require("visible", 0 <= self.visible < 1, "in [0, 1)")
+        require("color_distance", 0 < self.color_distance <= 0.35, "in (0, 0.35]")
+        require("tries", self.tries >= 1, "at least 1")
+
+    @property
+    def content_hash(self) -> str:
+        """16 hex digits that depend on the settings alone."""
+        return content_hash(self)
+
+    @classmethod
+    def crowded(cls, n: int, family: str = "same-plane") -> SceneConfig:
+        """Scenes of exactly n boxes, 2 to 30, to see how planning time grows with their number.
+
+        The boxes are slimmer and lower than elsewhere, so that 30 of them stand on the same
+        table, all in sight; for fewer the settings are the same, so that only n differs.
+        """
+        extra = int(family == "on")
+        return cls(
+            family=family,
+            min_objects=n - extra,
+            max_objects=n - extra,
+            max_edge=0.075,
+            max_height=0.06,
+            stack_height=0.12,
+            crowding=0.8,
+            visible=0.3,
+            tries=300,
+        )
+
+
+def sample_scene(
+    config: SceneConfig, *, seed: int, index: int, split: str = "train", attempt: int = 0
+) -> Scene | None:
+    """Draw scene `index` of a split; None when this attempt failed (try the next `attempt`).
+
+    Pure: the result depends on the arguments alone.
+    """
+    rng = generator(seed, f"{config.family}/{split}", index, attempt)
+    total = int(rng.integers(config.min_objects, config.max_objects + 1))
+    total += config.family == "on"
+    ranges = config.randomisation
+    if ranges is not None:
+        config = replace(
+            config,
+            light=draw_light(rng, config.light, ranges),
+            table=draw_table(rng, config.table, ranges),
+            camera=draw_camera(rng, config.camera, ranges),
+        )
+    texture = config.table.texture
+    colors = draw_colors(
+        rng,
+        total,
+        [config.table.color, *([texture.color] if texture else [])],
+        distance=ranges.color_delta_e if ranges else config.color_distance,
+        perceptual=ranges is not None,
+    )
+    if colors is None:
+        return None
+    on_top = 0
+    if config.family == "on":
+        on_top = min(1 + int(rng.binomial(total - 1, config.stacking)), total // 2)
+    standing = Standing(config)
+    for i, (name, color) in enumerate(colors):
+        box = None
+        if i >= total - on_top:
+            box = _stacked_box(rng, name, color, standing, config)
+        # One box stands on another; a further one that finds no place there goes to the table.
+        if box is None and i != total - on_top:
+            box = _table_box(rng, name, color, standing, config)
+        if box is None:
+            return None
+        standing.add(box)
+    # Crowded boxes come after their neighbours and the stacked ones come last: shuffled, so
+    # that the order of objects tells nothing.
+    objects = tuple(standing.boxes[i] for i in rng.permutation(total))
+    return Scene(
+        objects=objects,
+        table=config.table,
+        camera=config.camera,
+        light=config.light,
+        robot=config.robot,
+    )
+
+
+def _size(rng: np.random.Generator, config: SceneConfig) -> tuple[float, float, float]:
+    """Edges of a box: one footprint edge fits the hand, unless it is drawn as an obstacle."""
+    obstacle = rng.random() < config.obstacle_share
+    if obstacle:
+        low = min(GRASPABLE_EDGE + 0.015, config.max_edge)
+        a, b = rng.uniform(low, config.max_edge, 2)
+    else:
+        a = rng.uniform(config.min_edge, GRASPABLE_EDGE)
+        b = rng.uniform(config.min_edge, config.max_edge)
+    if rng.random() < 0.5:
+        a, b = b, a
+    height = rng.uniform(config.min_edge, config.max_height)
+    # Floored to 0.1 mm, so that a limit stays kept and files stay readable.
+    x, y, z = (math.floor(edge * 1e4 + 1e-6) / 1e4 for edge in (a, b, height))
+    return x, y, z
+
+
+def _table_box(
+    rng: np.random.Generator,
+    name: str,
+    color: Color,
+    standing: Standing,
+    config: SceneConfig,
+) -> Box | None:
+    boxes, size = standing.boxes, _size(rng, config)
+    crowding = config.crowding_on if config.family == "on" else config.crowding
+    crowd = bool(boxes) and rng.random() < crowding
+    fitting: list[Box] = []
+    for _ in range(config.tries):
+        if crowd:
+            x, y, yaw = _beside(rng, size, boxes[int(rng.integers(len(boxes)))], config)
+        else:
+            x, y, yaw = _anywhere(rng, config)
+        box = Box(
+            name=name,
+            size=size,
+            position=(round(x, 4), round(y, 4), size[2] / 2),
+            yaw=round(yaw, 4),
+            color=color,
+        )
+        if standing.admits(box):
+            fitting.append(box)
+            if not crowd or len(fitting) == config.choices:
+                break
+    return max(fitting, key=lambda box: _closed(box, boxes), default=None)
+
+
+def _closed(box: Box, boxes: list[Box]) -> int:
+    """How many goal regions a new box closes: those it stands in, and its own."""
+    closing = sum(box.covers(x, y) for other in boxes for x, y in _ways_in(other))
+    return closing + sum(any(b.covers(x, y) for b in boxes) for x, y in _ways_in(box))
+
+
+def _ways_in(box: Box) -> list[tuple[float, float]]:
+    """The middles of its four goal regions, for a subject of common width."""
+    (x, y, _), (ex, ey), r = box.position, box.extents, COMMON_RADIUS + GAP / 2
+    return [(x + ex + r, y), (x - ex - r, y), (x, y + ey + r), (x, y - ey - r)]
+
+
+def _anywhere(rng: np.random.Generator, config: SceneConfig) -> tuple[float, float, float]:
+    """A pose that is uniform over the table's part in front of the robot."""
+    half_x, half_y = config.table.size[0] / 2, config.table.size[1] / 2
+    return (
+        float(rng.uniform(-half_x, half_x)),
+        float(rng.uniform(-half_y, half_y)),
+        float(rng.uniform(-math.pi / 2, math.pi / 2)),
+    )
+
+
+def _beside(
+    rng: np.random.Generator,
+    size: tuple[float, float, float],
+    neighbour: Box,
+    config: SceneConfig,
+) -> tuple[float, float, float]:
+    """A pose in one of the neighbour's four goal regions, its long edge across the way in.
+
+    Near the region's middle and broadside on, it leaves no room beside it more often. The gap
+    is too narrow for another box, and mostly wide enough for a finger.
+    """
+    quarter = int(rng.integers(4))
+    axis = quarter % 2
+    broadside = 0.0 if (size[0] < size[1]) == (axis == 0) else math.pi / 2
+    yaw = broadside + float(rng.uniform(-BROADSIDE, BROADSIDE))
+    c, s = abs(math.cos(yaw)), abs(math.sin(yaw))
+    extents = (c * size[0] + s * size[1]) / 2, (s * size[0] + c * size[1]) / 2
+    gap = max(config.spacing, float(rng.uniform(NEAR, GAP)))
+    along = neighbour.extents[axis] + extents[axis] + gap
+    across = float(rng.uniform(-CENTRED, CENTRED)) * neighbour.extents[1 - axis]
+    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
+    x = neighbour.position[0] + along * c - across * s
+    y = neighbour.position[1] + along * s + across * c
+    return x, y, yaw
+
+
+def _stacked_box(
+    rng: np.random.Generator,
+    name: str,
+    color: Color,
+    standing: Standing,
+    config: SceneConfig,
+) -> Box | None:
+    """A box on one that carries none yet, its centre over the middle half of the top face."""
+    taken = {box.on for box in standing.boxes}
+    free = [
+        box
+        for box in standing.boxes
+        if box.on is None
+        and box.name not in taken
+        and box.top + config.min_edge < config.stack_height
+    ]
+    for _ in range(min(config.tries, 4 * len(free))):
+        carrier = free[int(rng.integers(len(free)))]
+        tallest = min(config.stack_height - carrier.top, config.max_height)
+        size = _size(rng, replace(config, obstacle_share=0.0, max_height=tallest))
+        yaw = float(rng.uniform(-math.pi / 2, math.pi / 2))
+        c, s = math.cos(carrier.yaw), math.sin(carrier.yaw)
+        dx, dy = rng.uniform(-0.25, 0.25, 2) * carrier.size[:2]
+        box = Box(
+            name=name,
+            size=size,
+            position=(
+                round(carrier.position[0] + float(c * dx - s * dy), 4),
+                round(carrier.position[1] + float(s * dx + c * dy), 4),
+                carrier.top + size[2] / 2,
+            ),
+            yaw=round(yaw, 4),
+            color=color,
+            on=carrier.name,
+        )
+        if standing.admits(box):
+            return box
+    return None

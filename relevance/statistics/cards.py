@@ -1,0 +1,338 @@
+"""The dataset card: one folder with a page of Markdown and its pictures, nothing else needed.
+
+Numbers come from the SQL views; pictures are PNG, so that the page reads anywhere, with a few
+example scenes drawn from the stored images.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from relevance.scene import Predicate
+from relevance.statistics.tables import Statistics, Table, cell, statistics
+from relevance.store import Dataset
+
+PAGE = "README.md"
+MADE_WITH = ("relevance", "numpy", "pybullet", "casadi", "numba", "pyarrow", "duckdb")
+"""Packages whose versions the card states."""
+SPLIT_COLORS = {"train": "#2f6db3", "validation": "#8a939d", "test": "#c26a1c"}
+FAMILY_COLORS = {"same-plane": "#2f6db3", "on": "#c26a1c"}
+SUBJECT, REFERENCE, RELEVANT = "#ffffff", "#101418", "#ff2d95"
+"""Outlines in the example scenes."""
+_WIDTH, _DPI = 7.2, 110
+
+
+def write_card(root: str | Path, out: str | Path) -> Path:
+    """Write a dataset's card into a folder (made if needed); returns its page.
+
+    Equal datasets give an equal page but for the times that they took. Raises DatasetError when
+    there is no dataset.
+    """
+    dataset, found, out = Dataset.open(root), statistics(root), Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    pictures: dict[str, str] = {}
+    for name, (title, draw) in _PICTURES.items():
+        figure = draw(found)
+        if figure is not None:
+            figure.savefig(out / f"{name}.png", dpi=_DPI, metadata={"Software": None})
+            pictures[name] = title
+    examples = _examples(dataset)
+    if examples is not None:
+        examples.savefig(out / "examples.png", dpi=_DPI, metadata={"Software": None})
+        pictures["examples"] = (
+            "Example scenes: subject outlined in white, reference in black, relevant in pink"
+        )
+    page = out / PAGE
+    temporary = out / f".{PAGE}.{os.getpid()}.tmp"
+    temporary.write_text(card(found, dataset, pictures))
+    temporary.replace(page)
+    return page
+
+
+def card(found: Statistics, dataset: Dataset, pictures: Mapping[str, str] = {}) -> str:
+    """The page: what there is, pictures (file stem -> title), tables, and what made it."""
+    lines = [f"# Dataset {Path(found.path).resolve().name}", "", _summary(found), ""]
+    for name, title in pictures.items():
+        lines += [f"![{title}]({name}.png)", "", f"*{title}.*", ""]
+    for table in found.tables:
+        lines += ["", f"## {table.title}", "", *_markdown(table)]
+    lines += ["", "## Provenance", "", *_provenance(dataset)]
+    return "\n".join(lines) + "\n"
+
+
+def _summary(found: Statistics) -> str:
+    shares = {
+        family: f"{100 * relevant / queries:.1f}% of {queries} ({family})"
+        for family, (queries, relevant) in _balance(found).items()
+        if queries
+    }
+    return (
+        f"{found.scenes} scenes, {found.goals} goals, {found.plans} plans that hold, "
+        f"{found.queries} queries; relevant are {' and '.join(shares.values()) or 'none'}. "
+        f"{found.shards[0]} of {found.shards[1]} shards made, "
+        f"{found.labelled[0]} of {found.labelled[1]} labelled."
+    )
+
+
+def _provenance(dataset: Dataset) -> list[str]:
+    description = dataset.description
+    config = description.get("config", {})
+    rows = {
+        "content hash of labels and images": dataset.content_hash(),
+        "seed": config.get("seed"),
+        "scene settings (hash)": description.get("hashes", {}).get("scenes"),
+        "plan settings (hash)": description.get("hashes", {}).get("plans"),
+        "planner version": description.get("planner_version"),
+        "label policy": config.get("policy"),
+        "schema versions": ", ".join(f"{k} {v}" for k, v in description.get("tables", {}).items()),
+        "merged from": ", ".join(str(source.dataset.path.name) for source in dataset.sources),
+        "card written with": ", ".join(
+            [f"Python {sys.version.split()[0]}", *(f"{name} {version(name)}" for name in MADE_WITH)]
+        ),
+    }
+    lines = [_bar(("what", "value")), _bar(("---", "---"))]
+    lines += [_bar((name, str(value))) for name, value in rows.items() if value not in (None, "")]
+    return [
+        *lines,
+        "",
+        "Every setting:",
+        "",
+        "```json",
+        json.dumps(config, indent=2, sort_keys=True),
+        "```",
+    ]
+
+
+def _markdown(table: Table) -> list[str]:
+    if not table.rows:
+        return ["None."]
+    lines = [_bar(table.columns), _bar("---" for _ in table.columns)]
+    return lines + [_bar(cell(value) for value in row) for row in table.rows]
+
+
+def _bar(cells: Iterable[str]) -> str:
+    return "| " + " | ".join(text.replace("|", "\\|") for text in cells) + " |"
+
+
+# pictures ---------------------------------------------------------------------------------------
+
+
+def _dicts(table: Table) -> list[dict[str, Any]]:
+    return [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+
+
+def _figure(columns: int, height: float = 2.6) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(1, columns))
+    for ax in axes:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.tick_params(labelsize=8)
+        ax.title.set_fontsize(9)
+        ax.xaxis.label.set_fontsize(8)
+        ax.yaxis.label.set_fontsize(8)
+    return figure, list(axes)
+
+
+def _balance(found: Statistics) -> dict[str, tuple[int, int]]:
+    """Queries and relevant ones of each family."""
+    sums = {"same-plane": (0, 0), "on": (0, 0)}
+    for row in _dicts(found["label_balance"]):
+        family = Predicate(row["predicate"]).family
+        queries, relevant = sums[family]
+        sums[family] = queries + row["queries"], relevant + row["relevant"]
+    return sums
+
+
+def _label_balance(found: Statistics) -> Figure | None:
+    rows = [row for row in _dicts(found["label_balance"]) if row["queries"]]
+    if not rows:
+        return None
+    figure, (ax,) = _figure(1)
+    predicates = [p.value for p in Predicate if any(r["predicate"] == p.value for r in rows)]
+    splits = [s for s in SPLIT_COLORS if any(r["split"] == s for r in rows)]
+    width = 0.8 / len(splits)
+    for i, split in enumerate(splits):
+        mine = {row["predicate"]: row["relevant_share"] for row in rows if row["split"] == split}
+        at = np.array([predicates.index(p) for p in mine]) + (i - (len(splits) - 1) / 2) * width
+        ax.bar(at, [100 * s for s in mine.values()], width, label=split, color=SPLIT_COLORS[split])
+    ax.set_xticks(range(len(predicates)), predicates)
+    ax.set_ylabel("relevant queries, %")
+    ax.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def _shares(
+    ax: Axes, rows: list[dict[str, Any]], key: str, count: str, family: Callable[[Any], str]
+) -> None:
+    """Bars: for each family, the share of each value of `key`."""
+    values = sorted({row[key] for row in rows})
+    families = [f for f in FAMILY_COLORS if any(family(row) == f for row in rows)]
+    width = 0.8 / max(len(families), 1)
+    for i, name in enumerate(families):
+        mine = [row for row in rows if family(row) == name]
+        total = sum(row[count] for row in mine)
+        heights = [100 * sum(r[count] for r in mine if r[key] == v) / total for v in values]
+        at = np.arange(len(values)) + (i - (len(families) - 1) / 2) * width
+        ax.bar(at, heights, width, label=name, color=FAMILY_COLORS[name])
+    ax.set_xticks(range(len(values)), [str(value) for value in values])
+    ax.set_ylabel("%")
+
+
+def _lengths(found: Statistics) -> Figure | None:
+    lengths, blockers = _dicts(found["plan_lengths"]), _dicts(found["plan_blockers"])
+    if not lengths:
+        return None
+    figure, (left, right) = _figure(2)
+    for ax, rows, key, label in (
+        (left, lengths, "n_actions", "actions of the plan"),
+        (right, blockers, "blockers", "objects in the way"),
+    ):
+        _shares(ax, rows, key, "plans", lambda row: Predicate(row["predicate"]).family)
+        ax.set_xlabel(label)
+    left.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def _sizes(found: Statistics) -> Figure | None:
+    rows = _dicts(found["by_size"])
+    if not rows:
+        return None
+    figure, axes = _figure(3)
+    for ax, key, label, factor in (
+        (axes[0], "relevant_share", "relevant queries, %", 100),
+        (axes[1], "plan_share", "goals with a plan, %", 100),
+        (axes[2], "median_seconds", "median planning time, ms", 1000),
+    ):
+        for family, color in FAMILY_COLORS.items():
+            mine = [r for r in rows if r["family"] == family and r[key] is not None]
+            if mine:
+                ax.plot(
+                    [row["n_objects"] for row in mine],
+                    [factor * row[key] for row in mine],
+                    marker="o",
+                    markersize=3,
+                    color=color,
+                    label=family,
+                )
+        ax.set_xlabel("boxes")
+        ax.set_ylabel(label)
+        ax.set_ylim(bottom=0)
+    axes[0].legend(fontsize=8, frameon=False)
+    return figure
+
+
+def _visibility(found: Statistics) -> Figure | None:
+    rows = _dicts(found["visibility_tenths"])
+    if not rows:
+        return None
+    figure, (ax,) = _figure(1, 2.2)
+    _shares(ax, rows, "tenth", "objects", lambda row: row["family"])
+    names = [f"{10 * int(tick.get_text())}+" for tick in ax.get_xticklabels()]
+    ax.set_xticks(range(len(names)), names)
+    ax.set_xlabel("share of the object that shows, %")
+    ax.set_ylabel("objects, %")
+    ax.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def _failures(found: Statistics) -> Figure | None:
+    goals: dict[str, int] = {}
+    for row in _dicts(found["plan_failures"]):
+        # Reasons that start with an object's name differ in it alone.
+        reason = row["reason"] if row["status"] != "infeasible" else _general(row["reason"])
+        goals[reason] = goals.get(reason, 0) + row["goals"]
+    if not goals:
+        return None
+    ordered = sorted(goals.items(), key=lambda item: (item[1], item[0]))[-8:]
+    figure, (ax,) = _figure(1, 0.7 + 0.28 * len(ordered))
+    bars = ax.barh(
+        [name for name, _ in ordered], [100 * n / found.goals for _, n in ordered], color="#8a939d"
+    )
+    ax.bar_label(bars, [str(n) for _, n in ordered], fontsize=8, padding=3)
+    ax.set_xlabel("goals, %")
+    return figure
+
+
+def _general(reason: str) -> str:
+    head, verb, rest = reason.partition(" cannot ")
+    return f"the subject cannot {rest}" if verb and " " not in head else reason
+
+
+def _seconds(found: Statistics) -> Figure | None:
+    rows = _dicts(found["bound_seconds"])
+    if not rows:
+        return None
+    figure, (ax,) = _figure(1, 2.4)
+    names = [row["predicate"] for row in rows]
+    left = np.zeros(len(rows))
+    colors = {
+        "pose": "#2f6db3",
+        "keyframe": "#3a8a5f",
+        "path": "#c26a1c",
+        "rest": "#8a939d",
+    }
+    for part, color in colors.items():
+        widths = np.array([1000 * (row[part] or 0.0) / row["goals"] for row in rows])
+        ax.barh(names, widths, left=left, color=color, label=part)
+        left += widths
+    ax.set_xlabel("mean time a goal, ms")
+    ax.legend(fontsize=8, frameon=False, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return figure
+
+
+_PICTURES: dict[str, tuple[str, Callable[[Statistics], Figure | None]]] = {
+    "balance": ("Relevant share of the queries", _label_balance),
+    "lengths": ("Plan lengths, and objects in the way", _lengths),
+    "sizes": ("What the number of boxes does", _sizes),
+    "failures": ("Goals without a plan, by reason", _failures),
+    "visibility": ("How much of the objects shows", _visibility),
+    "seconds": ("Planning time by bound (replays left out)", _seconds),
+}
+
+
+_EXAMPLES = """
+    SELECT p.scene_id, p.split, p.shard, p.predicate, p.subject, p.reference, p.moved, p.n_actions
+    FROM plans AS p
+    WHERE p.holds
+    QUALIFY row_number() OVER (
+        PARTITION BY p.predicate
+        ORDER BY p.split <> 'test', least(p.n_actions, 4) DESC, md5(p.plan_id)) = 1
+    ORDER BY p.predicate
+"""
+
+
+def _examples(dataset: Dataset) -> Figure | None:
+    """One scene for each predicate, with what its plan moves."""
+    with dataset.connect() as connection:
+        found = connection.execute(_EXAMPLES)
+        names = [column[0] for column in found.description or ()]
+        rows = [dict(zip(names, row, strict=True)) for row in found.fetchall()]
+    if not rows:
+        return None
+    figure = Figure(figsize=(_WIDTH, 1.75 * -(-len(rows) // 2)), layout="constrained")
+    grid = figure.subplots(-(-len(rows) // 2), 2, squeeze=False).ravel()
+    for ax in grid:
+        ax.set_axis_off()
+    for ax, row in zip(grid, rows, strict=False):
+        sample = next(
+            s for s in dataset.samples(row["split"], [row["shard"]]) if s.key == row["scene_id"]
+        )
+        ax.imshow(sample.image)
+        colors = dict.fromkeys(row["moved"], RELEVANT)
+        colors |= {row["subject"]: SUBJECT, row["reference"]: REFERENCE}
+        for name, color in colors.items():
+            shown = sample.mask == sample.scene.names.index(name) + 1
+            ax.contour(shown, levels=[0.5], colors=[color], linewidths=1.4)
+        title = f"{row['predicate']}({row['subject']}, {row['reference']}): {row['n_actions']}"
+        ax.set_title(f"{title} actions", fontsize=7.5)
+    return figure

@@ -1,0 +1,351 @@
+"""The benchmark: its tasks, its reference, its figures, and the command."""
+
+import csv
+import json
+import math
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from relevance.benchmarks import (
+    MAX_EDGE,
+    BenchmarkError,
+    draw,
+    measure_completeness,
+    measure_planning,
+    measure_scaling,
+    measure_searches,
+    measure_stability,
+    save,
+)
+from relevance.benchmarks.against import measure_against
+from relevance.benchmarks.completeness import Compared, completeness_table
+from relevance.benchmarks.reference import CLEARANCE, _gap, shortest
+from relevance.benchmarks.stability import (
+    JITTER,
+    Jittered,
+    equal_plans,
+    jitter,
+    jittered,
+    stability_table,
+)
+from relevance.benchmarks.summary import interval, ratio_of_medians, share
+from relevance.cli import main
+from relevance.planner import Counts, PlannerConfig, PlanResult, Seconds, plan
+from relevance.scene import Box, Scene, footprint_gap, goal_holds, read_scenes
+
+RED, GREEN, BLUE = (0.8, 0.1, 0.1), (0.1, 0.7, 0.1), (0.1, 0.1, 0.8)
+
+
+def box(name, x, y, color=RED, size=(0.05, 0.05, 0.06), **rest):
+    height = rest.pop("bottom", 0.0) + size[2] / 2
+    return Box(name=name, size=size, position=(x, y, height), color=color, **rest)
+
+
+def found(table):
+    return {str(row[0]): row[1] for row in table.rows}
+
+
+@pytest.fixture(scope="module")
+def tasks():
+    return draw(40, 17)
+
+
+# -- tasks -----------------------------------------------------------------------------------------
+
+
+def test_tasks_depend_on_the_seed_alone_and_a_longer_draw_keeps_the_earlier(tasks):
+    assert draw(7, 17) == tasks[:7]
+    assert draw(7, 18) != tasks[:7]
+    assert draw(7, 17, stream="another") != tasks[:7]
+
+
+def test_predicates_and_sizes_come_in_equal_shares_and_no_goal_is_true_yet(tasks):
+    assert set(Counter(task.goal.predicate for task in tasks).values()) == {8}
+    assert Counter(task.n_objects for task in tasks) == dict.fromkeys(range(3, 11), 5)
+    assert not any(goal_holds(task.scene.objects, task.goal) for task in tasks)
+
+
+def test_thirty_boxes_can_be_drawn():
+    drawn = draw(5, 3, boxes=(30, 30), max_edge=MAX_EDGE)
+    assert [task.n_objects for task in drawn] == [30] * 5
+    assert max(max(b.size[:2]) for task in drawn for b in task.scene.objects) <= MAX_EDGE
+
+
+def test_impossible_settings_name_what_is_wrong():
+    for words, count, seed, boxes in (
+        ("tasks = 0", 0, 1, (3, 5)),
+        ("seed = -1", 1, -1, (3, 5)),
+        (r"boxes = \(2, 5\)", 1, 1, (2, 5)),
+    ):
+        with pytest.raises(BenchmarkError, match=words):
+            draw(count, seed, boxes=boxes)
+
+
+# -- figures ---------------------------------------------------------------------------------------
+
+
+def test_intervals_cover_and_shrink_with_the_sample():
+    rng = np.random.default_rng(1)
+    widths = []
+    for count in (50, 5000):
+        sample = rng.exponential(size=count)
+        here = interval(sample, "median")
+        assert here.value == np.median(sample)
+        assert here.low <= here.value <= here.high
+        widths.append(here.high - here.low)
+    assert widths[1] < widths[0] / 4
+    assert here.low < math.log(2) < here.high
+    assert math.isnan(interval([], "mean").value)
+    assert interval([2.0], "p99").high == 2.0
+
+
+def test_ratio_of_medians_pairs_the_tasks():
+    times = np.random.default_rng(2).lognormal(size=200)
+    ratio = ratio_of_medians(100 * times, times)
+    assert ratio.value == pytest.approx(100)
+    assert ratio.high - ratio.low < 1e-9  # the same tasks are drawn for both
+
+
+def test_shares_say_how_many_of_how_many():
+    assert share(995, 1000) == "995 of 1000 = 99.5% (98.8 to 99.8)"
+    assert share(0, 0) == "0 of 0"
+
+
+# -- the exhaustive reference ----------------------------------------------------------------------
+
+
+def test_gap_equals_the_scenes_own_separating_axis():
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        a, b = (
+            box(
+                name,
+                *rng.uniform(-0.1, 0.1, 2),
+                size=(*rng.uniform(0.03, 0.12, 2), 0.05),
+                yaw=rng.uniform(-3, 3),
+            )
+            for name in "ab"
+        )
+        axis = np.array([[math.cos(a.yaw), math.sin(a.yaw)]])
+        gap = _gap(np.array([a.position[:2]]), axis, a.size[0] / 2, a.size[1] / 2, b)
+        assert gap[0] == pytest.approx(footprint_gap(a, b), abs=1e-12)
+
+
+FREE = (box("red", 0.0, 0.25), box("blue", 0.0, -0.1, BLUE))
+BLOCKER = box("green", 0.0, 0.0, GREEN, size=(0.11, 0.06, 0.06))
+
+
+def test_reference_counts_the_boxes_that_must_go():
+    scene = Scene(objects=FREE)
+    goal = scene.goal("on-the-left(red, blue)")
+    assert shortest(scene, goal, CLEARANCE) == 0
+    blocked = Scene(objects=(*FREE, BLOCKER))
+    assert shortest(blocked, goal, CLEARANCE) == 1
+    top = box("grey", 0.0, 0.0, (0.5, 0.5, 0.5), bottom=0.06, size=(0.05,) * 3, on="green")
+    assert shortest(Scene(objects=(*blocked.objects, top)), goal, CLEARANCE) == 2
+
+
+def test_reference_knows_what_cannot_be_taken_or_reached():
+    goal = "on-the-left(red, blue)"
+    wide = Scene(objects=(box("red", 0.0, 0.25, size=(0.1, 0.1, 0.06)), FREE[1]))
+    assert shortest(wide, wide.goal(goal), CLEARANCE) is None
+    stuck = replace(BLOCKER, size=(0.11, 0.085, 0.06))  # too wide for the hand
+    scene = Scene(objects=(*FREE, replace(stuck, position=(0.0, 0.0, 0.03))))
+    assert shortest(scene, scene.goal(goal), CLEARANCE) is None
+    far = Scene(objects=(box("red", 0.37, 0.57), FREE[1]))
+    assert shortest(far, far.goal(goal), CLEARANCE) is None
+
+
+def test_more_clearance_never_makes_a_task_easier():
+    for task in draw(20, 5, boxes=(3, 5)):
+        needs = [shortest(task.scene, task.goal, c) for c in (CLEARANCE, 0.01)]
+        assert (needs[0] if needs[0] is not None else 9) <= (
+            needs[1] if needs[1] is not None else 9
+        )
+
+
+def test_completeness_counts_what_is_lost():
+    row = Compared(
+        task=0, scene_id="", goal="", predicate="on", n_objects=3, status="solved", reason="",
+        ambiguous=False, moved=("red",), reference=0, robust=0,
+    )  # fmt: skip
+    rows = [row, replace(row, moved=("a", "red")), replace(row, status="infeasible", moved=()),
+            replace(row, reference=None, robust=None)]  # fmt: skip
+    lines = completeness_table(rows).rows
+    assert [line[1].split(" = ")[0] for line in lines] == [
+        "3 of 4", "1 of 3", "3 of 4", "1 of 3", "1 of 3", "1 of 3", "1 of 2", "1 of 2", "1",
+    ]  # fmt: skip
+
+
+# -- stability -------------------------------------------------------------------------------------
+
+
+def test_jitter_moves_every_box_by_the_same_distance_and_carries_what_stands_on_it():
+    top = box("green", 0.0, -0.1, GREEN, size=(0.04,) * 3, bottom=0.06, on="blue")
+    scene = Scene(objects=(*FREE, top))
+    moved = jitter(scene, np.random.default_rng(4))
+    shift = {
+        name: np.array(moved[name].position) - np.array(scene[name].position)
+        for name in scene.names
+    }
+    for own in (shift["red"], shift["blue"], shift["green"] - shift["blue"]):
+        assert np.linalg.norm(own) == pytest.approx(JITTER)
+        assert own[2] == 0
+    assert moved.id != scene.id
+
+
+def test_equal_plans_notice_one_bit(tasks):
+    result = plan(tasks[0].scene, tasks[0].goal)
+    assert equal_plans(result, plan(tasks[0].scene, tasks[0].goal))
+    phase = result.phases[0]
+    q = phase.q.copy()
+    q[3, 2] = np.nextafter(q[3, 2], 1.0)
+    assert not equal_plans(
+        result, replace(result, phases=(replace(phase, q=q), *result.phases[1:]))
+    )
+
+
+def test_stability_counts_flips_and_what_the_flag_foretells():
+    row = Jittered(
+        task=0, scene_id="", goal="", predicate="on", n_objects=4, status="solved",
+        status_moved="solved", moved=("a",), moved_moved=("a",), ambiguous=False,
+        ambiguous_moved=False, same_again=True, labels=2, flips=0,
+    )  # fmt: skip
+    rows = [
+        row,
+        replace(row, moved_moved=("b", "a"), flips=1),
+        replace(row, moved_moved=("b", "a"), flips=1, ambiguous=True),
+        replace(row, ambiguous=True),
+        replace(row, status_moved="infeasible", moved_moved=(), labels=0, ambiguous=True),
+    ]
+    lines = found(stability_table(rows))
+    counts = {name: value.split(" = ")[0] for name, value in lines.items()}
+    assert counts["labels that flip (both solved)"] == "2 of 8"
+    assert counts["labels that flip, rows not flagged"] == "1 of 4"
+    assert counts["goals whose moved set flips (both solved)"] == "2 of 4"
+    assert counts["goals that turn from solved to not or back"] == "1 of 5"
+    assert counts["precision: flagged goals that flip"] == "2 of 3"
+    assert counts["recall: flipped goals that were flagged"] == "2 of 3"
+    assert counts["goals that flip unflagged"] == "1 of 2"
+
+
+def test_jittered_tasks_are_planned_on_moved_scenes(tasks):
+    row = jittered(tasks[1], 3, PlannerConfig())
+    assert row.same_again
+    assert row.status == plan(tasks[1].scene, tasks[1].goal).status
+    moved = jitter(
+        tasks[1].scene, np.random.Generator(np.random.Philox(key=3, counter=[0, 0, 0, 1]))
+    )
+    assert row.moved_moved == plan(moved, tasks[1].goal).moved
+
+
+# -- the parts -------------------------------------------------------------------------------------
+
+
+def test_planning_measures_every_task_and_replays_every_plan(tasks, tmp_path):
+    heard = []
+    measured = measure_planning(tasks[:10], progress=lambda *step: heard.append(step))
+    assert heard == [(done, 10) for done in range(1, 11)]
+    for row, task in zip(measured.rows, tasks, strict=False):
+        assert (row.task, row.scene_id) == (task.index, task.scene.id)
+        assert 0 < row.cpu_pose + row.cpu_keyframe + row.cpu_path < row.cpu < 5
+        assert (row.replay_ok is None) == (not row.solved)
+    solved = sum(row.solved for row in measured.rows)
+    tables = {table.name: table for table in measured.tables}
+    truth = found(tables["truth"])["plans that replay"]
+    assert truth.startswith(f"{solved} of {solved}")
+    everything = next(row for row in tables["outcomes"].rows if row[0] == "all")
+    assert everything[1:3] == (10, solved)
+    for plot in measured.plots:
+        for file in save(plot, tmp_path):
+            assert file.stat().st_size > 1000
+    assert {file.name for file in tmp_path.iterdir()} == {
+        "speed.png", "speed.svg", "truth.png", "truth.svg",
+    }  # fmt: skip
+
+
+def test_searches_and_scaling_run_both(tasks):
+    measured = measure_searches(tasks[:5])
+    assert all(row.nodes_tree >= row.nodes_informed for row in measured.rows)
+    sizes = {n: draw(2, 1, boxes=(n, n)) for n in (3, 6)}
+    scaled = measure_scaling(sizes, config=PlannerConfig(node_limit=3))
+    assert [(row.n_objects, row.search) for row in scaled.rows] == [
+        (n, search) for n in (3, 6) for _ in range(2) for search in ("informed", "tree")
+    ]
+    assert any(row.status == "limit" for row in scaled.rows)
+
+
+def test_against_counts_both_and_lets_the_replay_judge(tasks):
+    def peer(scene, goal):
+        """A peer that solves the third task only, and says nonsense on the second."""
+        mine = plan(scene, goal)
+        nothing = PlanResult(
+            goal=goal, status="limit", final={}, counts=Counts(), seconds=Seconds(total=1.0)
+        )
+        if scene == tasks[1].scene:
+            return replace(mine, phases=mine.phases[:-1])
+        return mine if scene == tasks[2].scene else nothing
+
+    assert all(plan(task.scene, task.goal).status == "solved" for task in tasks[1:3])
+    measured = measure_against(tasks[:3], peer, name="other")
+    assert [row.replay_ok_peer for row in measured.rows] == [None, False, True]
+    lines = found(measured.tables[1])
+    assert lines["solved by other"].startswith("2 of 3")
+    assert lines["plans that replay, other"].startswith("1 of 2")
+    assert lines["stopped at the limit, other"].startswith("1 of 3")
+
+
+def test_completeness_and_stability_cover_every_task(tasks):
+    small = draw(4, 2, boxes=(3, 4))
+    assert [row.task for row in measure_completeness(small).rows] == [0, 1, 2, 3]
+    rows = measure_stability(tasks[:3], seed=1).rows
+    assert [row.task for row in rows] == [0, 1, 2]
+    assert all(row.same_again for row in rows)
+
+
+# -- the command -----------------------------------------------------------------------------------
+
+
+def test_bench_writes_rows_tables_plots_and_scenes_that_plan_reads(tmp_path, capsys):
+    assert main(["bench", "planner", "--tasks", "5", "--seed", "9", "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr()
+    assert "--seed 9 remakes these tasks" in printed.err
+    for title in ("Planning time", "Truth of plans", "Stability", "Tree against", "Completeness"):
+        assert title in printed.out
+    names = {file.name for file in tmp_path.iterdir()}
+    stems = {"tasks", "stability", "searches", "completeness", "scaling"}
+    assert {f"{stem}.csv" for stem in stems} <= names
+    assert {"speed.png", "speed.svg", "scaling.png", "summary.json"} <= names
+    with (tmp_path / "tasks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    scenes = read_scenes(tmp_path / "scenes.jsonl")
+    assert [row["scene_id"] for row in rows] == [scene.id for scene in scenes]
+    assert [task.scene.id for task in draw(5, 9)] == [scene.id for scene in scenes]
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["seed"] == 9
+    assert "truth" in {table["name"] for table in summary["tables"]}
+
+
+def test_parts_are_chosen_and_a_fresh_seed_is_told(tmp_path, capsys):
+    out = str(tmp_path)
+    assert main(["bench", "planner", "--tasks", "2", "--out", out, "--parts", "searches"]) == 0
+    seed = capsys.readouterr().err.split("--seed ")[1].split()[0]
+    first = (tmp_path / "searches.csv").read_text()
+    assert not (tmp_path / "tasks.csv").exists()
+    again = ["bench", "planner", "--tasks", "2", "--out", out, "--parts", "searches"]
+    assert main([*again, "--seed", seed]) == 0
+    assert [line.split(",")[:5] for line in first.splitlines()] == [
+        line.split(",")[:5] for line in (tmp_path / "searches.csv").read_text().splitlines()
+    ]
+
+
+def test_bench_without_a_known_target_says_which_there_are(capsys):
+    assert main(["bench"]) == 0
+    assert "bench planner" in capsys.readouterr().out
+    assert main(["bench", "nothing"]) == 2
+    assert "bench planner" in capsys.readouterr().err
+    assert main(["bench", "planner", "--tasks", "0"]) == 2
+    assert "--tasks 0: expected at least 1" in capsys.readouterr().err

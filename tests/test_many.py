@@ -1,0 +1,206 @@
+"""Many machines: the flows on a Dask cluster, and a dataset in an object store."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from relevance.cli import main
+from relevance.generation import (
+    Counts,
+    DatasetConfig,
+    finish,
+    generate_shard,
+    label_shard,
+    prepare,
+)
+from relevance.statistics import check
+from relevance.store import Dataset, DatasetError, locate, replacing, sql
+
+FEW = {
+    "train.same_plane": 0,
+    "train.on": 4,
+    "validation.same_plane": 0,
+    "validation.on": 0,
+    "test.same_plane": 0,
+    "test.on": 2,
+    "scenes_per_shard": 2,
+    "goals_per_scene": 1,
+}
+CONFIG = DatasetConfig(train=Counts(on=4), test=Counts(on=2), scenes_per_shard=2, goals_per_scene=1)
+CLOCKS = ("timings", "durations")
+
+
+def complete(root: str | Path) -> None:
+    for spec in prepare(root, CONFIG):
+        generate_shard(root, CONFIG, spec)
+        for predicate in spec.predicates:
+            label_shard(root, CONFIG, spec, predicate)
+    finish(root)
+
+
+def hashes(root: str | Path) -> dict[str, str]:
+    there = locate(root)
+    return {
+        name: hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in there.rglob("*")
+        if file.is_file()
+        for name in [str(file).removeprefix(f"{there}/")]
+        if name.split("/")[0] not in CLOCKS
+    }
+
+
+@pytest.fixture(scope="module")
+def calm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset as this process makes it, in a folder."""
+    root = tmp_path_factory.mktemp("many") / "calm"
+    complete(root)
+    return root
+
+
+@pytest.fixture(scope="module")
+def bucket() -> Iterator[str]:
+    """A bucket of a local object store; its address and keys are in the environment alone."""
+    moto = pytest.importorskip("moto.server")
+    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    given = {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        "AWS_ACCESS_KEY_ID": "somebody",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }
+    before = {name: os.environ.get(name) for name in given}
+    os.environ.update(given)
+    try:
+        files = locate("s3://datasets/x").fs  # type: ignore[attr-defined]
+        files.mkdir("datasets")
+        yield "s3://datasets"
+    finally:
+        server.stop()
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def test_an_object_store_holds_the_same_bytes(bucket: str, calm: Path) -> None:
+    root = f"{bucket}/one"
+    complete(root)
+    assert hashes(root) == hashes(calm)
+    assert check(root) == []
+    query = "from label_balance"
+    assert sql(root, query) == sql(calm, query)
+    there, here = Dataset.open(root), Dataset.open(calm)
+    for split in ("train", "test"):
+        for a, b in zip(
+            there.samples(split, shuffle_seed=3), here.samples(split, shuffle_seed=3), strict=True
+        ):
+            assert a.scene == b.scene
+            assert (a.image == b.image).all()
+    assert there.content_hash() == here.content_hash()
+    # another policy lies beside, there too
+    for spec in prepare(root, CONFIG):
+        label_shard(root, CONFIG, spec, "on", policy="any-minimal")
+    assert [of.policy for of in Dataset.open(root).labellings()] == ["any-minimal"]
+    _, [(n, m)] = sql(root, "select (select count(*) from labels), count(*) from beside_labels")
+    assert n == m > 0
+
+
+@pytest.mark.slow
+def test_what_is_broken_there_is_named_and_repaired(
+    bucket: str, calm: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    root = f"{bucket}/broken"
+    complete(root)
+    file = Dataset.open(root).images_path("train", 1)
+    files: Any = file
+    files.fs.pipe_file(files.path, file.read_bytes()[:5000])
+    gone: Any = Dataset.open(root).shard_path("labels", split="test", shard=0, predicate="on")
+    gone.unlink()
+    assert main(["check", root, "--no-render"]) == 1
+    named = capfd.readouterr().out
+    assert "images/split=train/shard-000001.tar: truncated" in named
+    assert "labels/predicate=on/split=test/shard-000000.parquet: expected there" in named
+    assert main(["repair", root, "--workers", "1"]) == 0
+    assert hashes(root) == hashes(calm)
+
+
+def test_an_object_appears_whole_or_not_at_all(bucket: str) -> None:
+    path = locate(f"{bucket}/atomic/file.bin")
+
+    def stop_midway() -> None:
+        with replacing(path) as temporary:
+            temporary.write_bytes(b"half")
+            raise RuntimeError("midway")
+
+    with pytest.raises(RuntimeError, match="midway"):
+        stop_midway()
+    assert not path.exists()
+    with replacing(path) as temporary:
+        temporary.write_bytes(b"whole")
+        assert not path.exists()
+    assert path.read_bytes() == b"whole"
+    assert [item.name for item in path.parent.iterdir()] == ["file.bin"]
+
+
+def test_a_bucket_without_a_dataset_is_named(bucket: str) -> None:
+    with pytest.raises(DatasetError, match=r"s3://datasets/none: no dataset\.json there"):
+        Dataset.open(f"{bucket}/none")
+
+
+def test_slashes_that_a_path_has_folded() -> None:
+    for given in ("s3://datasets/a", Path("s3://datasets/a")):
+        assert str(locate(given)) == "s3://datasets/a"
+    assert locate("data/a") == Path("data/a")
+
+
+FLOWS = """
+import os, sys
+from dask.distributed import LocalCluster
+
+if __name__ == "__main__":
+    root, overrides = sys.argv[1], eval(sys.argv[2])
+    from flows.generate import generate
+    from flows.label import label
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        made = generate(
+            dataset=root, preset="smoke", overrides=overrides, cluster=cluster.scheduler_address
+        )
+        labelled = label(dataset=root, cluster=cluster.scheduler_address)
+        again = label(dataset=root, cluster=cluster.scheduler_address)
+    print("made", made["written"], labelled["written"], again["written"])
+"""
+
+
+@pytest.mark.parametrize("where", ["folder", "bucket"])
+@pytest.mark.slow
+def test_the_flows_on_a_dask_cluster(where: str, bucket: str, calm: Path, tmp_path: Path) -> None:
+    pytest.importorskip("prefect_dask")
+    root = f"{bucket}/dask" if where == "bucket" else str(tmp_path / "dataset")
+    script = tmp_path / "run.py"
+    script.write_text(FLOWS)
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT")}
+    done = subprocess.run(
+        [sys.executable, str(script), root, repr(FEW)],
+        env=kept | {"PREFECT_HOME": str(tmp_path / "home"), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "made 3 3 0" in done.stdout
+    assert hashes(root) == hashes(calm)
+    assert check(root) == []

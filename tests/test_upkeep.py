@@ -1,0 +1,553 @@
+"""A dataset over time: labelled anew, grown, merged, broken and repaired, gathered, exported."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pytest
+from test_generation import contents, untouched
+
+from relevance import generation, labels
+from relevance.cli import main
+from relevance.generation import (
+    Counts,
+    DatasetConfig,
+    actual,
+    append,
+    estimate,
+    finish,
+    generate_shard,
+    integrity,
+    label_shard,
+    labelled,
+    load_config,
+    merge,
+    prepare,
+    repair,
+    settings,
+    shards_of,
+)
+from relevance.generation.estimating import Estimate
+from relevance.labels import POLICIES, label_rows, necessary, stored_scene
+from relevance.planner import PlannerConfig, plan
+from relevance.sampling import SceneConfig
+from relevance.statistics import check
+from relevance.store import SCHEMAS, Dataset, DatasetError, compact, export, sql
+
+CONFIG = DatasetConfig(
+    seed=5,
+    train=Counts(same_plane=2, on=4),
+    test=Counts(on=2),
+    scenes_per_shard=2,
+    goals_per_scene=3,
+    scene=SceneConfig(max_objects=7),
+    replay_share=0.0,
+    test_replay_share=0.2,
+)
+
+
+def complete(root: Path, config: DatasetConfig = CONFIG, policy: str | None = None) -> Path:
+    """Generate and label whatever is missing, in this process."""
+    for spec in prepare(root, config):
+        generate_shard(root, config, spec)
+        for predicate in spec.predicates:
+            label_shard(root, config, spec, predicate, policy=policy)
+    finish(root)
+    return root
+
+
+@cache
+def small() -> Path:
+    """A finished dataset of CONFIG, made once; copy it before you change it."""
+    return complete(Path(tempfile.mkdtemp(prefix="relevance-test-")) / "dataset")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cleanup() -> Iterator[None]:
+    yield
+    if small.cache_info().currsize:
+        shutil.rmtree(small().parent)
+        small.cache_clear()
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(small(), tmp_path / "dataset"))
+
+
+def images(root: Path) -> list[Path]:
+    return [*root.rglob("*.tar"), *(root / "scenes").rglob("*.parquet")]
+
+
+# labelled anew ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy", ["necessary", "any-minimal"])
+def test_another_policy_lies_beside(made: Path, policy: str) -> None:
+    before = contents(made)
+    with untouched(*(file for file in made.rglob("*") if file.is_file())):
+        complete(made, policy=policy)
+    dataset = Dataset.open(made)
+    [there] = dataset.labellings()
+    assert there.policy == policy
+    assert len(dataset.files("labels", of=there)) == len(dataset.files("labels")) == 4 + 2 + 1
+    own = {(r["plan_id"], r["query"]): r["relevant"] for r in dataset.read_rows("labels")}
+    rows = dataset.read_rows("labels", of=there)
+    other = {(r["plan_id"], r["query"]): r for r in rows}
+    assert own.keys() == other.keys()
+    assert {r["policy"] for r in rows} == {policy}
+    assert all(r["because"] for r in rows)
+    for key, row in other.items():
+        # what is necessary every plan moves; what this plan moves some plan moves
+        if policy == "necessary":
+            assert own[key] >= row["relevant"]
+        else:
+            assert own[key] <= row["relevant"]
+    # chosen by name, every view is about them
+    _, [(named,)] = sql(made, "select any_value(policy) from label_balance", policy=policy)
+    assert named == policy
+    _, [(count,)] = sql(made, "select count(*) from beside_labels", policy=policy)
+    assert count == len(own)
+    _, changes = sql(made, "select relevant_before, relevant_now, why from label_changes")
+    different = sum(own[key] != row["relevant"] for key, row in other.items())
+    assert len(changes) == different
+    assert all(f"{policy}: " in why and "; found: " in why for _, _, why in changes)
+    assert check(made) == []
+    kept = {name: content for name, content in contents(made).items() if name in before}
+    assert kept == before
+
+
+def test_necessary_is_what_the_planner_cannot_do_without() -> None:
+    dataset = Dataset.open(small())
+    scenes = {row["scene_id"]: row for row in dataset.read_rows("scenes")}
+    blocked = [p for p in dataset.read_rows("plans") if p["holds"] and len(p["moved"]) > 1]
+    assert blocked, "expected plans that move a blocker"
+    for row in blocked[:4]:
+        scene = stored_scene(scenes[row["scene_id"]])
+        verdicts = necessary(scene, row, CONFIG.planner)
+        goal = f"{row['predicate']}({row['subject']}, {row['reference']})"
+        for name, verdict in verdicts.items():
+            others = frozenset(scene.names) - {name}
+            without = plan(scene, goal, config=CONFIG.planner, movable=others)
+            assert verdict.relevant == (without.status != "solved")
+        made = label_rows(scenes[row["scene_id"]], row, "necessary", verdicts)
+        assert {r["query"]: r["because"] for r in made} == {
+            name: verdict.because for name, verdict in verdicts.items()
+        }
+
+
+def test_any_minimal_is_the_union_of_the_alternatives() -> None:
+    scene = {
+        "scene_id": "s",
+        "objects": [{"name": name, "visible_fraction": 1.0} for name in ("a", "b", "c", "d")],
+    }
+    row = {
+        **dict.fromkeys(labels._FROM_PLAN, ""),
+        "scene_id": "s",
+        "subject": "a",
+        "reference": "b",
+        "holds": True,
+        "moved": ["c", "a"],
+        "alternatives": [["c", "a"], ["d", "a"]],
+    }
+    found = {r["query"]: r for r in label_rows(scene, row, "any-minimal")}
+    assert {name for name, r in found.items() if r["relevant"]} == {"a", "c", "d"}
+    assert found["d"]["because"] == "a plan as short moves d, a"
+    alone = {r["query"] for r in label_rows(scene, row, "found") if r["relevant"]}
+    assert alone == {"a", "c"}
+
+
+def test_other_plans_take_the_place_and_the_old_ones_lie_beside(made: Path) -> None:
+    before, config = contents(made), replace(CONFIG, planner=PlannerConfig(max_actions=2))
+    with pytest.raises(DatasetError, match=r"config\.planner\.max_actions: .* plan it anew"):
+        prepare(made, config)
+    prepare(made, config, replan=True)
+    assert [message for _, message in integrity(Dataset.open(made)) if "stale" in message]
+    with untouched(*images(made)):
+        complete(made, config)
+    assert check(made) == []
+    dataset = Dataset.open(made)
+    [old] = dataset.labellings()
+    assert old == CONFIG.labelling
+    for table in ("plans", "labels"):
+        for file in dataset.files(table, of=old):
+            name = str(file.relative_to(made)).partition(f"/{table}/")[2]
+            name = name.removeprefix("policy=found/")
+            assert file.read_bytes() == before[f"{table}/{name}"]
+    _, changes = sql(
+        made, "select relevant_before, relevant_now, policy_now, why from label_changes"
+    )
+    assert changes, "a plan of two actions moves no blocker"
+    gone = [why for _, now, _, why in changes if now is None]
+    assert gone
+    assert all(why.startswith("no plan that holds now: ") for why in gone)
+    # and back: nothing is planned again
+    prepare(made, CONFIG, replan=True)
+    timings = {file: file.read_bytes() for file in dataset.files("timings", of=old)}
+    complete(made, CONFIG)
+    assert {name: c for name, c in contents(made).items() if name in before} == before
+    again = {file: file.read_bytes() for file in dataset.files("timings")}
+    assert sorted(again.values()) == sorted(timings.values())
+    assert check(made) == []
+
+
+def test_another_planner_version_asks_first(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = contents(made)
+    for module in (settings, labels):
+        monkeypatch.setattr(module, "PLANNER_VERSION", "next")
+    with pytest.raises(DatasetError, match=r"planner_version: .* found 'next'; plan it anew"):
+        prepare(made, CONFIG)
+    assert prepare(made, CONFIG, scenes_only=True), "scenes do not ask for the planner"
+    prepare(made, CONFIG, replan=True)
+    complete(made)
+    _, rows = sql(made, "select planner_version = 'next', current from labellings")
+    assert sorted(rows) == [(False, False), (True, True)]
+    assert check(made) == []
+    assert {name: c for name, c in contents(made).items() if name.startswith("images")} == {
+        name: c for name, c in before.items() if name.startswith("images")
+    }
+
+
+def test_another_goal_set(made: Path) -> None:
+    other = replace(CONFIG, goals_seed=77, goals_per_scene=1)
+    prepare(made, other, replan=True)
+    complete(made, other)
+    _, [(now, before)] = sql(
+        made, "select (select count(*) from plans), (select count(*) from beside_plans)"
+    )
+    assert 0 < now < before
+    assert load_config(Dataset.open(made)) == other
+    assert check(made) == []
+
+
+def test_unknown_policies_are_named(made: Path) -> None:
+    spec = shards_of(Dataset.open(made))[0]
+    with pytest.raises(ValueError, match=f"policy 'x': expected one of {', '.join(POLICIES)}"):
+        label_shard(made, CONFIG, spec, spec.predicates[0], policy="x")
+
+
+# grown and merged ------------------------------------------------------------------------------
+
+
+def test_appending(made: Path) -> None:
+    before = contents(made)
+    append(made, "test", same_plane=1, on=1)
+    config = load_config(Dataset.open(made))
+    assert (config.test.same_plane, config.test.on) == (1, 3)
+    assert config.train == CONFIG.train
+    complete(made, config)
+    after = contents(made)
+    assert [n for n in before if n != "dataset.json" and after[n] != before[n]] == []
+    assert check(made) == []
+    with pytest.raises(DatasetError, match="expected at least 1 in all"):
+        append(made, "train")
+    with pytest.raises(DatasetError, match="split 'dev': expected one of train"):
+        append(made, "dev", on=1)
+
+
+def test_merging_by_reference(made: Path, tmp_path: Path) -> None:
+    other = complete(tmp_path / "other", replace(CONFIG, seed=6, train=Counts(on=3)))
+    files = [file for root in (made, other) for file in root.rglob("*") if file.is_file()]
+    with untouched(*files):
+        merged = merge([made, other], tmp_path / "both")
+        assert check(merged.path) == []
+    assert [str(f.relative_to(merged.path)) for f in merged.path.rglob("*")] == ["dataset.json"]
+    parts = [Dataset.open(made), Dataset.open(other)]
+    for split in ("train", "test"):
+        numbers = [part.shards(split) for part in parts]
+        assert merged.shards(split) == [*range(sum(map(len, numbers)))]
+        assert merged.shards(split, "on") == sorted(merged.shards(split, "on"))
+        keys = [sample.key for part in parts for sample in part.samples(split)]
+        assert [sample.key for sample in merged.samples(split)] == keys
+        for table in ("scenes", "plans", "labels"):
+            rows = merged.read_rows(table, split=split)
+            assert len(rows) == sum(len(part.read_rows(table, split=split)) for part in parts)
+            assert {row["shard"] for row in rows} <= {*merged.shards(split)}
+    shard = merged.shards("train")[-1]
+    from_view = "select distinct scene_id from labels where split = 'train' and shard = "
+    assert {row["scene_id"] for row in merged.read_rows("labels", split="train", shard=shard)} == {
+        name for (name,) in sql(merged.path, from_view + str(shard))[1]
+    }
+    # what a source gets later under another policy is seen
+    for root in (made, other):
+        complete(root, load_config(Dataset.open(root)), policy="any-minimal")
+    _, [(count, policy)] = sql(
+        merged.path, "select count(*), any_value(policy) from labels", policy="any-minimal"
+    )
+    assert (count, policy) == (len(merged.read_rows("labels")), "any-minimal")
+    with pytest.raises(DatasetError, match="is merged by reference; make shards in "):
+        label_shard(merged.path, CONFIG, shards_of(merged)[0], "behind")
+    # three: a merged one counts as its sources
+    third = complete(tmp_path / "third", replace(CONFIG, seed=7, train=Counts(on=1)))
+    assert len(merge([merged.path, third], tmp_path / "three").sources) == 3
+
+
+def test_merging_refuses(made: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="expected at least two"):
+        merge([made], tmp_path / "c")
+    twin = Path(shutil.copytree(made, tmp_path / "twin"))
+    with pytest.raises(DatasetError, match=r"scene \w+ of train: expected in one dataset only"):
+        merge([made, twin], tmp_path / "c")
+    file = twin / "dataset.json"
+    said = json.loads(file.read_text())
+    file.write_text(json.dumps({**said, "tables": {**said["tables"], "labels": 99}}))
+    with pytest.raises(DatasetError, match=r"tables: expected .*'labels': 2.* found .*99"):
+        merge([made, twin], tmp_path / "c")
+    assert not (tmp_path / "c").exists()
+
+
+def test_a_merged_dataset_names_what_is_broken_in_a_source(made: Path, tmp_path: Path) -> None:
+    other = complete(tmp_path / "other", replace(CONFIG, seed=6, train=Counts(on=1)))
+    merged = merge([made, other], tmp_path / "both")
+    next(iter(Dataset.open(other).files("labels"))).unlink()
+    assert {b.file for b in check(merged.path)} == {
+        "../other/labels/predicate=on/split=test/shard-000000.parquet"
+    }
+
+
+# broken and repaired ---------------------------------------------------------------------------
+
+
+def _flip(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 3] ^= 1
+    file.write_bytes(content)
+
+
+def _cut(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[: -file.stat().st_size // 2])
+
+
+def _another_split(root: Path) -> None:
+    for kind, end in (("scenes", "parquet"), ("images", "tar")):
+        shutil.copy(
+            root / f"{kind}/split=train/shard-000001.{end}",
+            root / f"{kind}/split=test/shard-000000.{end}",
+        )
+
+
+def _stale_labels(root: Path) -> None:
+    """A labels file of another planner version, as it was written."""
+    dataset = Dataset.open(root)
+    where = {"split": "train", "shard": 1, "predicate": "on"}
+    rows = [{**row, "planner_version": "0"} for row in dataset.read_rows("labels", **where)]
+    made_by = {**CONFIG.labelling.made_by, "planner": "0"}
+    dataset.write_rows("labels", rows, made_by=made_by, **where)
+
+
+ON = "predicate=on/split=train/shard-000001.parquet"
+BREAKAGES: dict[str, tuple[Any, str]] = {
+    "flipped scenes": (lambda r: _flip(r / f"scenes/{ON[13:]}"), f"scenes/{ON[13:]}"),
+    "flipped plans": (lambda r: _flip(r / f"plans/{ON}"), f"plans/{ON}"),
+    "flipped labels": (lambda r: _flip(r / f"labels/{ON}"), f"labels/{ON}"),
+    "flipped tar": (
+        lambda r: _flip(r / "images/split=train/shard-000001.tar"),
+        "images/split=train/shard-000001.tar",
+    ),
+    "truncated tar": (
+        lambda r: _cut(r / "images/split=test/shard-000000.tar"),
+        "images/split=test/shard-000000.tar",
+    ),
+    "truncated plans": (lambda r: _cut(r / f"plans/{ON}"), f"plans/{ON}"),
+    "deleted scenes": (lambda r: (r / f"scenes/{ON[13:]}").unlink(), f"scenes/{ON[13:]}"),
+    "deleted tar": (
+        lambda r: (r / "images/split=train/shard-000001.tar").unlink(),
+        "images/split=train/shard-000001.tar",
+    ),
+    "deleted plans": (lambda r: (r / f"plans/{ON}").unlink(), f"plans/{ON}"),
+    "deleted timings": (lambda r: (r / f"timings/{ON}").unlink(), f"timings/{ON}"),
+    "deleted labels": (lambda r: (r / f"labels/{ON}").unlink(), f"labels/{ON}"),
+    "stale labels": (_stale_labels, f"labels/{ON}"),
+    "a scene in two splits": (_another_split, "scenes/split=test/shard-000000.parquet"),
+}
+
+
+USUAL = ("flipped labels", "truncated tar", "deleted plans", "stale labels")
+USUAL += ("a scene in two splits",)
+
+
+@pytest.mark.parametrize(
+    "breakage",
+    [pytest.param(b, marks=() if b in USUAL else pytest.mark.slow) for b in BREAKAGES],
+)
+def test_every_breakage_is_named_and_made_good(made: Path, breakage: str) -> None:
+    before = contents(made)
+    break_it, name = BREAKAGES[breakage]
+    break_it(made)
+    named = [breach.file for breach in check(made, render=False)]
+    assert name in named
+    assert repair(made, named) == []
+    complete(made)
+    assert contents(made) == before
+    assert check(made, render=False) == []
+
+
+def test_labels_beside_are_checked_too(made: Path) -> None:
+    complete(made, policy="any-minimal")
+    dataset = Dataset.open(made)
+    [of] = dataset.labellings()
+    file = dataset.files("labels", of=of)[0]
+    whole = file.read_bytes()
+    _flip(file)
+    assert str(file.relative_to(made)) in {breach.file for breach in check(made, render=False)}
+    file.write_bytes(whole)
+    assert check(made, render=False) == []
+    # one of another policy in its place
+    keys = {key: dataset.file_keys(file)[key] for key in ("predicate", "split", "shard")}
+    other, made_by = dataset.read_rows("labels", **keys), CONFIG.labelling.made_by
+    dataset.write_rows("labels", other, of=of, made_by=made_by, **keys)
+    [breach] = check(made, render=False)
+    assert breach.message == "stale: expected policy any-minimal as its folder says, found found"
+
+
+def test_the_command_repairs(made: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    before = contents(made)
+    (made / f"labels/{ON}").unlink()
+    _flip(made / "images/split=test/shard-000000.tar")
+    assert main(["check", str(made)]) == 1
+    assert main(["repair", str(made), "--workers", "1"]) == 0
+    assert contents(made) == before
+    said = capfd.readouterr().err
+    assert "broken: images/split=test/shard-000000.tar" in said
+    assert main(["check", str(made)]) == 0
+
+
+def test_a_dead_writers_file_is_swept_and_a_living_ones_is_not(made: Path) -> None:
+    host, folder = socket.gethostname(), made / "scenes/split=train"
+    dead = folder / f".shard-000009.parquet.{host}-4194999-abcdef.tmp"
+    alive = folder / f".shard-000009.parquet.{host}-{os.getpid()}-abcdef.tmp"
+    elsewhere = folder / ".shard-000009.parquet.another-1-abcdef.tmp"
+    for file in (dead, alive, elsewhere):
+        file.write_bytes(b"half")
+    prepare(made, CONFIG)
+    assert [dead.exists(), alive.exists(), elsewhere.exists()] == [False, True, True]
+    os.utime(elsewhere, (0, 0))
+    prepare(made, CONFIG)
+    assert not elsewhere.exists()
+
+
+# gathered, exported, estimated -----------------------------------------------------------------
+
+
+def test_gathered_labels_answer_the_same_until_the_shards_change(made: Path) -> None:
+    queries = ("from label_balance", "select * from labels order by all")
+    before = [sql(made, query) for query in queries]
+    assert compact(Dataset.open(made)) == {"labels": len(before[1][1])}
+    gathered = sorted((made / "compacted").rglob("*.parquet"))
+    assert {file.parts[-7] for file in gathered} == {"policy=found"}
+    assert [sql(made, query) for query in queries] == before
+    assert check(made, render=False) == []
+    # what is gathered is what is read
+    gathered[0].unlink()
+    assert sql(made, queries[0]) != before[0]
+    changed = Dataset.open(made).files("labels")[0]
+    changed.write_bytes(changed.read_bytes())
+    assert [sql(made, query) for query in queries] == before
+
+
+def test_export_loads_with_datasets(made: Path, tmp_path: Path) -> None:
+    datasets = pytest.importorskip("datasets")
+    out = export(Dataset.open(made), tmp_path / "out")
+    stored = Dataset.open(made)
+    for split in ("train", "test"):
+        scenes = datasets.load_dataset(
+            str(out), "scenes", split=split, cache_dir=str(tmp_path / "cache")
+        )
+        samples = list(stored.samples(split))
+        assert [row["scene_id"] for row in scenes] == [sample.key for sample in samples]
+        for row, sample in zip(scenes, samples, strict=True):
+            assert (np.asarray(row["image"].convert("RGB")) == sample.image).all()
+            assert (np.asarray(row["mask"]) == sample.mask).all()
+            assert row["views"].size == (32 * len(sample.views), 32)
+            assert [box["name"] for box in row["objects"]] == list(sample.scene.names)
+        rows = datasets.load_dataset(
+            str(out), "labels", split=split, cache_dir=str(tmp_path / "cache")
+        )
+        assert rows.num_rows == len(stored.read_rows("labels", split=split))
+        assert sum(rows["relevant"]) == sum(
+            row["relevant"] for row in stored.read_rows("labels", split=split)
+        )
+    again = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
+    export(stored, out)
+    assert {file: file.read_bytes() for file in again} == again
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(DatasetError, match="expected an empty folder or an earlier export"):
+        export(stored, out)
+
+
+def test_an_estimate_is_close_and_kept(made: Path, tmp_path: Path) -> None:
+    many = replace(CONFIG, train=Counts(same_plane=20, on=40), test=Counts(on=20))
+    found = estimate(many, sample=4)
+    assert found.quantities.scenes == 80
+    real = actual(made)
+    assert real.scenes == 8
+    assert real.goals == len(Dataset.open(made).read_rows("plans"))
+    per_scene = found.quantities.gigabytes / 80, real.gigabytes / 8
+    assert 0.4 < per_scene[0] / per_scene[1] < 1.6
+    assert 0.4 < found.quantities.goals / (10 * real.goals) < 1.6
+    assert found.quantities.hours_labels > 0
+    assert found.quantities.hours_scenes > 0
+    found.write(tmp_path / "new")
+    assert Estimate.read(tmp_path / "new") == found
+    assert Estimate.read(made) is None
+
+
+@pytest.mark.slow
+def test_estimate_command_before_and_after(
+    made: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--preset", "smoke", "--sample", "4", "--workers", "1", "--format", "json"]
+    new = tmp_path / "new"
+    few = ["--train.same-plane", "0", "--test.same-plane", "0", "--validation.same-plane", "0"]
+    assert main(["estimate", str(new), *arguments, *few]) == 0
+    rows = {row["quantity"]: row for row in json.loads(capfd.readouterr().out)}
+    assert rows["scenes"]["estimate"] == 20
+    assert rows["hours"]["estimate"] > 0
+    assert [file.name for file in new.iterdir()] == ["estimate.json"]
+    shutil.copy(new / "estimate.json", made)
+    assert main(["estimate", str(made), "--format", "json"]) == 0
+    rows = {row["quantity"]: row for row in json.loads(capfd.readouterr().out)}
+    assert rows["scenes"]["actual"] == 8
+    assert rows["scenes"]["actual / estimate"] == pytest.approx(8 / 20)
+    assert check(made, render=False) == []
+
+
+def test_plain_duckdb_sees_what_changed(made: Path) -> None:
+    complete(made, policy="any-minimal")
+    config = replace(CONFIG, planner=PlannerConfig(max_actions=2))
+    prepare(made, config, replan=True)
+    complete(made, config)
+    with duckdb.connect() as plain:
+        plain.execute(f"SET VARIABLE dataset = '{made}'")
+        for statement in duckdb.extract_statements((SCHEMAS / "tables.sql").read_text()):
+            name = statement.query.split("VIEW ")[1].split()[0]
+            if name not in ("checkpoints", "predictions", "evaluations"):
+                plain.execute(statement)
+        plain.execute((SCHEMAS / "changes.sql").read_text())
+        count = "select count(*) from label_changes"
+        assert plain.execute(count).fetchall() == sql(made, count)[1]
+        assert sql(made, count)[1][0][0] > 0
+
+
+def test_finished_labels_need_no_worker(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_work(*_: Any, **__: Any) -> None:
+        raise AssertionError("nothing is left to do")
+
+    monkeypatch.setattr(generation.shards, "_compile", no_work)
+    monkeypatch.setattr(generation.shards, "plan", no_work)
+    dataset = Dataset.open(made)
+    for spec in prepare(made, CONFIG):
+        assert all(labelled(dataset, CONFIG, spec, p) for p in spec.predicates)
+    with untouched(*(file for file in made.rglob("*") if file.is_file())):
+        assert main(["label", str(made), "--workers", "1"]) == 0
