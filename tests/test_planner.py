@@ -3,10 +3,11 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from relevance.benchmarks.reference import CLEARANCE, shortest
-from relevance.planner import Guide, PlannerConfig, plan
+from relevance.planner import Guide, PlannerConfig, penetration, plan
 from relevance.sampling import SceneConfig, sample_goals, sample_scene
 from relevance.scene import Box, Predicate, Scene, SceneError, goal_holds
 from relevance.simulation import replay
@@ -49,6 +50,18 @@ def test_every_solved_plan_replays_and_reaches_its_goal(planned):
         assert verdict.max_penetration <= 1e-3
         assert result.max_penetration <= 1e-3
         assert goal_holds(scene.moved(result.final), goal)
+
+
+def test_dense_check_of_the_plan_alone_equals_the_solvers(planned):
+    for scene, _, result in planned:
+        if result.status == "solved":
+            assert penetration(scene, result) == pytest.approx(result.max_penetration, abs=1e-6)
+    scene, _, result = next(task for task in planned if task[2].status == "solved")
+    first = result.phases[0]
+    lean = np.zeros(7)
+    lean[1] = 0.3  # about the shoulder: the hand goes down by a hand's breadth
+    broken = replace(result, phases=(replace(first, q=first.q + lean), *result.phases[1:]))
+    assert penetration(scene, broken) > 1e-3
 
 
 def test_all_predicates_and_several_lengths_occur(planned):

@@ -8,6 +8,7 @@ from relevance.planner.search import (
     PlannerConfig,
     PlanResult,
     Scorer,
+    penetration,
     plan,
     warm_up,
 )
@@ -21,6 +22,7 @@ __all__ = [
     "PlannerConfig",
     "Scorer",
     "Seconds",
+    "penetration",
     "plan",
     "warm_up",
 ]

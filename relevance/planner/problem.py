@@ -433,6 +433,34 @@ class Problem:
             order=order, phases=tuple(phases), final=final, cost=cost, max_penetration=worst
         )
 
+    def penetration(self, motion: Motion) -> float:
+        """Worst penetration (m) of a solved sequence by the dense check alone.
+
+        The solver has done the same while it solved; this goes by the plan's phases and poses.
+        """
+        obstacles = self.obstacles.copy()
+        there = np.ones(len(obstacles), np.bool_)
+        worst = 0.0
+        for k, phase in enumerate(motion.phases):
+            name, holding = motion.order[k // 3], k % 3 == 1
+            i = self.index[name]
+            opening = "closed" if holding else "opening"
+            grasp = next(g for g in self.grasps[name] if getattr(g, opening) == phase.opening)
+            there[i] = not holding
+            if k % 3 == 2:  # the retreat
+                pose = motion.final[name]
+                x, y, z = pose.position
+                hx, hy, hz = obstacles[i, 4:7]
+                upright(x, y, z, pose.yaw, hx, hy, hz, obstacles[i])
+            body = self.bodies(name, grasp, holding=holding, opening=phase.opening)
+            margin, broken = (
+                np.zeros((len(body.link), there.sum())),
+                np.zeros((len(phase.q) - 1, 2)),
+            )
+            depth = path.dense_check(phase.q, self.arm, body, obstacles[there], margin, broken)
+            worst = max(worst, depth)
+        return worst
+
     def _phase(self, X, action: Action | None, opening: float, carried: str | None) -> Phase:
         dt = path.time_step(self.arm, X)
         return Phase(action=action, q=X, dt=dt, opening=opening, carried=carried)

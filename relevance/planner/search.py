@@ -151,6 +151,15 @@ def plan(
     return result
 
 
+def penetration(scene: Scene, result: PlanResult) -> float:
+    """Worst penetration (m) of a plan by the planner's own dense check, from the plan alone."""
+    motion = Motion(
+        order=result.moved, phases=result.phases, final=result.final, cost=result.cost,
+        max_penetration=result.max_penetration,
+    )  # fmt: skip
+    return Problem(scene, result.goal).penetration(motion)
+
+
 @cache
 def warm_up() -> None:
     """Compile the solvers now (once a process), so that no plan's time includes it."""
