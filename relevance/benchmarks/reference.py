@@ -4,8 +4,7 @@ It shares only the arm's reach and the gripper's rectangles with the planner; ev
 brute force over positions and angles, with a separating-axis gap in numpy. A goal is solvable
 with a set of boxes gone when each of them can be taken and put on the table in some order, and
 then the subject can be taken and stand in the goal region, gripper included. Motions are not
-looked at, and the reference box stays where it is. As in the planner's rules, `on` asks for a
-top face that carries nothing else.
+looked at, and the reference box stays where it is.
 """
 
 from __future__ import annotations
@@ -40,12 +39,8 @@ def shortest(scene: Scene, goal: Goal, clearance: float) -> int | None:
     solvable, namely those that do not hang on a millimetre.
     """
     others = [box.name for box in scene.objects if box.name not in (goal.subject, goal.reference)]
-    on = goal.predicate is Predicate.ON
-    above = {box.name for box in scene.objects if on and box.on == goal.reference}
     for count in range(min(MOST, len(others)) + 1):
         for gone in itertools.combinations(others, count):
-            if not above <= {*gone, goal.subject}:
-                continue
             away = {*gone, goal.subject}
             standing = [box for box in scene.objects if box.name not in away]
             if (

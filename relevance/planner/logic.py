@@ -18,18 +18,6 @@ def stacked_on(scene: Scene) -> dict[str, frozenset[str]]:
     }
 
 
-def goal_blockers(scene: Scene, goal: Goal) -> frozenset[str]:
-    """Objects that must leave before the subject can be placed, whatever the geometry.
-
-    For `on` the reference's top must be free. For every goal the subject may not carry anything.
-    """
-    above = stacked_on(scene)
-    blocking = above[goal.subject]
-    if goal.predicate is Predicate.ON:
-        blocking |= above[goal.reference]
-    return blocking - {goal.subject}
-
-
 def actions(goal: Goal, order: Sequence[str]) -> tuple[Action, ...]:
     """The action sequence of an order of moved objects, the subject last."""
     found = []

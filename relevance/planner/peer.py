@@ -213,6 +213,7 @@ def _attempt(
             reason = "the rules allow rai no action sequence"
             break
     status = "infeasible" if exhausted else "limit"
+    reason = reason or f"rai found no plan in {config.seconds:g} s"
     return PlanResult(
         goal=goal, status=status, reason=reason, final={}, counts=spent.counts,
         seconds=spent.seconds,
@@ -222,7 +223,10 @@ def _attempt(
 def _run(
     problem: RaiProblem, seed: int, seconds: float, spent: _Spent
 ) -> tuple[dict[str, Any] | None, str, bool]:
-    """One run of the subprocess: what it found, else why not, and whether it was exhausted."""
+    """One run of the subprocess: what it found, else why not, and whether it was exhausted.
+
+    No reason: its time was up.
+    """
     with tempfile.TemporaryDirectory(prefix="rai-") as name:
         folder = Path(name)
         (folder / "task.g").write_text(problem.configuration)
@@ -269,7 +273,7 @@ def _run(
         if ended:
             return None, "rai ran out of action sequences", True
         if process.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
-            return None, f"rai found no plan in {seconds:.3g} s", False
+            return None, "", False
         return None, f"rai stopped: {last}", False
 
 

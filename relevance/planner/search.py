@@ -338,7 +338,7 @@ class _Search:
         needed = [goal.subject, *(n for n in chosen if not problem.pickable(n, chosen))]
         found = frozenset().union(*(problem.above[name].union(*problem.blockers[name])
                                     for name in needed))  # fmt: skip
-        return found | logic.goal_blockers(problem.scene, goal)
+        return found - {goal.subject}
 
     def _orders(self, chosen: frozenset[str]) -> Iterator[tuple[str, ...]]:
         """The orders in which a set can be picked."""
@@ -357,8 +357,6 @@ class _Search:
     def _finish(self, gone: frozenset[str], prefixes: Iterable[tuple[str, ...]]) -> Motion | None:
         """Pick the subject once `gone` have left and place it at the goal: all bounds in turn."""
         problem, goal = self.problem, self.problem.goal
-        if not logic.goal_blockers(problem.scene, goal) <= gone:
-            return None
         options = problem.pickable(goal.subject, gone)
         if goal.reference not in gone:
             reference = problem.boxes[goal.reference]
