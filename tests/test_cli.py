@@ -129,7 +129,7 @@ def test_a_value_error_of_a_library_is_not_called_bad_input(
 ) -> None:
     import relevance.store
 
-    def broken(path: Path, query: str) -> None:
+    def broken(path: Path, query: str, *, policy: str | None) -> None:
         json.loads("{")
 
     monkeypatch.setattr(relevance.store, "sql", broken)

@@ -6,12 +6,10 @@ wall seconds they rest on.
 
 from __future__ import annotations
 
-import io
 import multiprocessing
-import tarfile
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +27,7 @@ from relevance.generation import (
     prepare,
 )
 from relevance.statistics import Table
-from relevance.store import Dataset, compact, decode, sql, synthetic_labels
+from relevance.store import Dataset, compact, decode, sql, synthetic_labels, undecoded
 
 SCENES_A_SECOND = 60.0
 """Wanted of one core, without planning, 320 x 192."""
@@ -126,15 +124,26 @@ def measure_making(
     return _measured("making", "Making", rates)
 
 
-def measure_reading(root: str | Path, *, split: str = "train", rounds: int = 3) -> Measured:
+def measure_reading(folder: Path, *, seed: int, rounds: int = 15) -> Measured:
     """The trainers' reader against decoding alone, scenes a processor second, one process.
 
+    Reads one shard of the laptop preset, made for the purpose.
     Both see the same scenes: decoding alone has their bytes in memory already; the reader opens
     shards, checks their hashes, takes samples apart, shuffles and decodes. The best of a few
     rounds each, taken in turns.
     """
+    preset = DatasetConfig.laptop()
+    counts = {"train": Counts(on=preset.scenes_per_shard), "validation": Counts(), "test": Counts()}
+    config = replace(preset, seed=seed, **counts)
+    split, root = "train", folder / "read"
+    for spec in prepare(root, config):
+        generate_shard(root, config, spec)
     dataset = Dataset.open(root)
-    items = [item for shard in dataset.shards(split) for item in _members(dataset, split, shard)]
+    items = [
+        item
+        for shard in dataset.shards(split)
+        for item in undecoded(dataset.read_images(split, shard), f"shard {shard}")
+    ]
     alone, reader = [], []
     for _ in range(rounds):
         start = time.process_time()
@@ -268,20 +277,6 @@ def _pool(processes: int, folder: Path, config: DatasetConfig) -> ProcessPoolExe
     pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
     list(pool.map(_warm, [(folder, config)] * processes))
     return pool
-
-
-def _members(dataset: Dataset, split: str, shard: int) -> list[Mapping[str, Any]]:
-    """Undecoded samples of a shard, as the reader has them just before it decodes."""
-    found: dict[str, dict[str, Any]] = {}
-    content = dataset.read_images(split, shard)
-    with tarfile.open(fileobj=io.BytesIO(content)) as tar:
-        for member in tar:
-            key, _, name = member.name.partition(".")
-            stream = tar.extractfile(member)
-            assert stream is not None, "members of an image tar are files"
-            sample = found.setdefault(key, {"__key__": key, "__url__": f"shard {shard}"})
-            sample[name] = stream.read()
-    return list(found.values())
 
 
 def _rate(what: str, count: int, seconds: float, unit: str) -> Rate:

@@ -48,7 +48,7 @@ def bench_planner(_: Any) -> Callable[..., int]:
             tasks: How many tasks speed, truth and stability look at; searches and completeness
                 take half as many, scaling a 50th for each number of boxes.
             seed: Remakes the tasks of an earlier run; a fresh one when not given.
-            out: Folder for rows and plots; bench/planner-SEED when not given.
+            out: Folder for rows and plots; data/bench/planner-SEED when not given.
             parts: What to measure; everything when not given (with --against only that).
             against: Another planner that takes turns with ours on the same tasks.
             limit: CPU seconds that the other planner has for a task.
@@ -63,7 +63,7 @@ def bench_planner(_: Any) -> Callable[..., int]:
 
             require_rai()
         chosen = parts if parts is not None else () if against else PARTS
-        folder = out or Path("bench") / f"planner-{seed}"
+        folder = out or Path("data/bench") / f"planner-{seed}"
         folder.mkdir(parents=True, exist_ok=True)
         say(f"--seed {seed} remakes these tasks; rows and plots go to {folder}")
         tables: list[Any] = []

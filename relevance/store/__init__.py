@@ -6,7 +6,7 @@ The only importer of pyarrow, duckdb and webdataset.
 from relevance.store.compacting import compact
 from relevance.store.dataset import SPLITS, Dataset, Labelling, Source, differences
 from relevance.store.exporting import export
-from relevance.store.images import MEMBERS, VIEW_SIZE, Pictures, Sample, decode
+from relevance.store.images import MEMBERS, VIEW_SIZE, Pictures, Sample, decode, undecoded
 from relevance.store.places import (
     absolute,
     copy_file,
@@ -59,4 +59,5 @@ __all__ = [
     "synthetic_labels",
     "table_schema",
     "type_name",
+    "undecoded",
 ]

@@ -29,7 +29,7 @@ import pyarrow.compute as pc
 
 from relevance.scene import content_hash
 from relevance.store import queries
-from relevance.store.images import Pictures, Sample, decode, encode
+from relevance.store.images import Pictures, Sample, decode, encode, undecoded
 from relevance.store.places import file_hash, is_remote, locate, replacing, sweep
 from relevance.store.tables import (
     DatasetError,
@@ -416,21 +416,21 @@ class Dataset:
         Shuffling permutes the shards, then draws from a buffer of undecoded samples; it depends
         on the seed alone. Raises DatasetError naming a truncated, changed or missing tar.
         """
-        # Here and not above: importing webdataset loads torch.
-        from webdataset.filters import detshuffle
-        from webdataset.tariterators import group_by_keys, tar_file_expander
-
         order = list(self.shards(split) if shards is None else shards)
         if shuffle_seed is not None:
             np.random.Generator(np.random.Philox(key=shuffle_seed)).shuffle(order)
 
-        def sources() -> Iterator[dict[str, Any]]:
-            for shard in order:
-                content = io.BytesIO(self.read_images(split, shard))
-                yield {"url": str(self.images_path(split, shard)), "stream": content}
-
-        raw: Iterable[dict[str, Any]] = group_by_keys(tar_file_expander(sources()))
+        raw: Iterable[dict[str, Any]] = (
+            item
+            for shard in order
+            for item in undecoded(
+                self.read_images(split, shard), str(self.images_path(split, shard))
+            )
+        )
         if shuffle_seed is not None:
+            # Here and not above: importing webdataset loads torch.
+            from webdataset.filters import detshuffle
+
             raw = detshuffle(bufsize=buffer, initial=buffer, seed=shuffle_seed).run(raw)
         for item in raw:
             yield decode(item)

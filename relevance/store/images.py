@@ -5,7 +5,8 @@ Everything is lossless: a stored scene renders again to equal pixels, and a test
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import io
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -64,6 +65,14 @@ def _encoded(extension: str, image: np.ndarray, options: list[int]) -> bytes:
     done, content = cv2.imencode(extension, image, options)
     assert done, f"{extension} of shape {image.shape} could not be encoded"
     return content.tobytes()
+
+
+def undecoded(content: bytes, url: str) -> Iterator[dict[str, Any]]:
+    """The samples of an image tar, members by name, as webdataset groups them."""
+    # Here and not above: importing webdataset loads torch.
+    from webdataset.tariterators import group_by_keys, tar_file_expander
+
+    yield from group_by_keys(tar_file_expander([{"url": url, "stream": io.BytesIO(content)}]))
 
 
 def decode(item: Mapping[str, Any]) -> Sample:
