@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -102,8 +103,30 @@ def one_server() -> Iterator[None]:
         return
     server = SubprocessASGIServer()  # one object a process: the one that the flow itself uses
     server.start()
-    with temporary_settings({PREFECT_API_URL: server.api_url}):
+    with temporary_settings({PREFECT_API_URL: server.api_url}), _ending_with(server):
         yield
+
+
+@contextmanager
+def _ending_with(server: SubprocessASGIServer) -> Iterator[None]:
+    """End this process when its server dies meanwhile; else it would try to reach it for minutes.
+
+    Finished shards stay, and the workers end with this process.
+    """
+    process, over = server.server_process, threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.5):
+            if process is not None and process.poll() is not None and not over.is_set():
+                print("the flow's Prefect server died; start the flow again", file=sys.stderr)
+                sys.stderr.flush()
+                os._exit(1)
+
+    threading.Thread(target=watch, name="end-with-server", daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()
 
 
 @contextmanager

@@ -39,3 +39,5 @@ def test_twenty_kills_of_flows_workers_and_servers_change_no_byte(tmp_path: Path
     assert [trial for trial in trials if trial.wrong or trial.left] == []
     broken = [trial for trial in trials if not trial.what.startswith(("kill", "full"))]
     assert all(trial.recovered for trial in broken), "check names every broken file"
+    full = [trial for trial in trials if trial.what == "full disk"]
+    assert not any(trial.recovered for trial in full), "the disk was full"

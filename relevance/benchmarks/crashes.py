@@ -34,6 +34,8 @@ CLOCKS = ("timings", "durations")
 """Tables outside the promise of equal bytes."""
 ENDING = 90.0
 """Seconds that everybody has to end after a kill."""
+WHOLE_RUN = 900.0
+"""Seconds that an undisturbed run may take."""
 
 Progress = Callable[[int, int], None]
 
@@ -118,6 +120,14 @@ class Pipeline:
             preexec_fn=limit,
         )
 
+    def complete(self, home: Path) -> None:
+        """Run it to its end; raises AssertionError when that is not a good one."""
+        process = self.start(home)
+        try:
+            assert process.wait(WHOLE_RUN) == 0, "expected an undisturbed run to end well"
+        finally:
+            kill_all(process.pid)
+
 
 def members(leader: int) -> dict[int, str]:
     """The living processes of a session, and what each one is."""
@@ -199,7 +209,9 @@ def kill_once(
             victim = rng.choice([one for one, kind in alive.items() if kind == what])
             with suppress(ProcessLookupError):
                 os.kill(victim, signal.SIGKILL)
-        _wait(lambda: process.poll() is not None and not members(process.pid), ENDING)
+        # without a worker the run goes on, by itself and to the end
+        patience = WHOLE_RUN if what == "worker" else ENDING
+        _wait(lambda: process.poll() is not None and not members(process.pid), patience)
         return Trial(
             number=number,
             what=f"kill {what}",
@@ -318,24 +330,21 @@ def disturb(
     trials: list[Trial] = []
     while len(trials) < kills:
         number = len(trials) + 1
+        if number % 8 == 4:
+            plain.complete(home)
+            trials.append(break_file(root, expected, rng, number=number))
+            continue
         if root.exists() and hashes(root).keys() >= expected.keys():
-            if number % 8 == 4:
-                trials.append(break_file(root, expected, rng, number=number))
-                continue
             lose_some(root, expected, rng)
         if number % 8 == 0:
-            most = 20_000  # bytes; less than an image tar has
+            most = 4_000  # bytes; less than any file of a shard has
             trials.append(fill_disk(plain, home, expected, number=number, most_bytes=most))
         else:
             made = kill_once(pipeline, home, expected, rng, number=number, longest=longest)
             trials += [made] if made else []
         if progress:
             progress(len(trials), kills)
-    process = pipeline.start(home)
-    try:
-        assert process.wait(600) == 0, "expected an undisturbed run to end well"
-    finally:
-        kill_all(process.pid)
+    pipeline.complete(home)
     different = {
         name for name in {*expected, *hashes(root)} if hashes(root).get(name) != expected.get(name)
     }

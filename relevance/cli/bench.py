@@ -70,7 +70,7 @@ def bench_planner(_: Any) -> Callable[..., int]:
         for name, work in _work(tasks, seed, chosen, against, limit, folder):
             with bar(name) as progress:
                 measured = work(progress)
-            _hand_over(measured, folder)
+            hand_over(measured, folder)
             tables += measured.tables
             summary = {"seed": seed, "tasks": tasks, "parts": list(chosen), "against": against}
             summary["tables"] = [dataclasses.asdict(table) for table in tables]
@@ -146,7 +146,7 @@ def _work(
         )
 
 
-def _hand_over(measured: Any, folder: Path) -> None:
+def hand_over(measured: Any, folder: Path) -> None:
     """Print a part's tables; write its rows and its plots."""
     from relevance.benchmarks import save
 
