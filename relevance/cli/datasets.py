@@ -284,7 +284,7 @@ def _bench(_: Preset) -> Callable[..., int]:
         folder.mkdir(parents=True, exist_ok=True)
         say(f"seed {seed}, pid {os.getpid()}, to {folder}")
         from relevance.benchmarks import dataset
-        from relevance.cli.bench import hand_over as hand_over
+        from relevance.cli.bench import hand_over
 
         with tempfile.TemporaryDirectory(prefix="relevance-bench-") as scratch:
             place = Path(scratch)
