@@ -130,7 +130,8 @@ class TrainConfig:
         """About five minutes on two cores.
 
         More steps on smaller batches learned more in the same time; exchanging colour channels
-        changed nothing in so short a run. One thread: two wait for each other as soon as a core is busy.
+        changed nothing in so short a run. One thread, since two wait for each other as soon as a
+        core is busy.
         """
         return cls(
             preset="demo",
