@@ -79,9 +79,15 @@ def interval(values: Sequence[float] | np.ndarray, statistic: str) -> Interval:
     value = float(compute(sample))
     if len(sample) == 1 or (sample == sample[0]).all():
         return Interval(value=value, low=value, high=value)
+    return _resampled((sample,), compute, value)
+
+
+def _resampled(samples: tuple[np.ndarray, ...], compute: Any, value: float) -> Interval:
+    """The bootstrap interval of a statistic; several samples are resampled as pairs."""
     found = bootstrap(
-        (sample,),
+        samples,
         compute,
+        paired=len(samples) > 1,
         vectorized=True,
         n_resamples=RESAMPLES,
         batch=200,
@@ -102,18 +108,7 @@ def ratio_of_medians(a: Sequence[float], b: Sequence[float]) -> Interval:
     value = float(ratio(x, y))
     if len(x) < 2:
         return Interval(value=value, low=np.nan, high=np.nan)
-    found = bootstrap(
-        (x, y),
-        ratio,
-        paired=True,
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        batch=200,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return Interval(value=value, low=float(found.low), high=float(found.high))
+    return _resampled((x, y), ratio, value)
 
 
 def share(part: int, whole: int) -> str:

@@ -274,13 +274,13 @@ def _bench(_: Preset) -> Callable[..., int]:
             shards: Files that they are in, for each predicate.
             kills: How often the making of a small dataset is disturbed.
             seed: Remakes an earlier run; a fresh one when not given.
-            out: Folder for tables and rows; bench/dataset-SEED when not given.
+            out: Folder for tables and rows; data/bench/dataset-SEED when not given.
             parts: What to measure.
         """
         if min(scenes, rows, shards, kills) < 1:
             raise UsageError("--scenes, --rows, --shards, --kills: expected at least 1")
         seed = secrets.randbits(31) if seed is None else seed
-        folder = out or Path("bench") / f"dataset-{seed}"
+        folder = out or Path("data/bench") / f"dataset-{seed}"
         folder.mkdir(parents=True, exist_ok=True)
         say(f"seed {seed}, pid {os.getpid()}, to {folder}")
         from relevance.benchmarks import dataset
