@@ -16,7 +16,8 @@ from typing import get_args
 
 import tyro
 
-from relevance.cli.commands import COMMANDS, Command, Preset
+from relevance.cli.arguments import Preset
+from relevance.cli.commands import COMMANDS, Command
 from relevance.cli.terminal import UsageError, say
 
 

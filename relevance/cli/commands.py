@@ -6,7 +6,6 @@ A maker imports only what its own flags need; the function imports the rest when
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import dataclasses
 import functools
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -16,18 +15,13 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from relevance.cli import datasets
+from relevance.cli.arguments import CORES, DatasetArg, OptionalPath, Preset, Workers
 from relevance.cli.bench import bench_planner
 from relevance.cli.processes import in_processes
 from relevance.cli.terminal import Format, UsageError, bar, bars, console, say, show, to_json
 
-Preset = Literal["smoke", "demo", "laptop", "paper"]
-DatasetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATASET")]
-OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
 OptionalName = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
 OptionalCount = Annotated[int | None, tyro.conf.arg(metavar="N")]
-Workers = Annotated[int, tyro.conf.arg(metavar="N")]
-
-CORES = len(os.sched_getaffinity(0))
 
 
 def _generate(preset: Preset) -> Callable[..., int]:

@@ -11,14 +11,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from relevance.cli.arguments import CORES, DatasetArg, Preset, Workers
 from relevance.cli.processes import in_processes
 from relevance.cli.terminal import Format, UsageError, bar, say, show
-
-Preset = Literal["smoke", "demo", "laptop", "paper"]
-DatasetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATASET")]
-Workers = Annotated[int, tyro.conf.arg(metavar="N")]
-
-CORES = len(os.sched_getaffinity(0))
 
 
 def _estimate(preset: Preset) -> Callable[..., int]:

@@ -34,7 +34,7 @@ import numpy as np
 from relevance.planner.kinematics import ARM, HOME, LINKS, panda
 from relevance.planner.path import SPEED, STEP
 from relevance.planner.problem import Counts, Seconds
-from relevance.planner.search import Guide, PlanResult, _rounds
+from relevance.planner.search import Guide, PlanResult, rounds
 from relevance.scene import (
     Action,
     Box,
@@ -182,7 +182,7 @@ def plan_rai(
         scores = guide.scorer.scores(scene, goal)
     spent = _Spent()
     result = None
-    for allowed in _rounds(everything, goal, guide, scores):
+    for allowed in rounds(everything, goal, guide, scores):
         result = _attempt(scene, goal, rai_problem(scene, goal, movable=allowed), config, spent)
         if result.status == "solved":
             break

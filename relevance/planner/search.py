@@ -142,7 +142,7 @@ def plan(
         scores = guide.scorer.scores(scene, goal)
         problem.seconds.guide = time.process_time() - scored
     result = None
-    for allowed in _rounds(everything, goal, guide, scores):
+    for allowed in rounds(everything, goal, guide, scores):
         search = _Search(problem, config, allowed, scores if _ordered(guide) else None)
         result = search.run(began)
         if result.status == "solved":
@@ -175,7 +175,7 @@ def _ordered(guide: Guide | None) -> bool:
     return guide is not None and guide.mode == "order"
 
 
-def _rounds(everything: frozenset[str], goal: Goal, guide: Guide | None, scores):
+def rounds(everything: frozenset[str], goal: Goal, guide: Guide | None, scores):
     """The object sets that a guide lets the search move, one after the other."""
     if guide is None or scores is None or guide.mode == "order":
         yield everything
