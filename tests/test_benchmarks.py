@@ -25,6 +25,7 @@ from relevance.benchmarks.completeness import Compared, completeness_table
 from relevance.benchmarks.reference import CLEARANCE, _gap, shortest
 from relevance.benchmarks.stability import (
     JITTER,
+    JITTERS,
     Jittered,
     equal_plans,
     jitter,
@@ -210,7 +211,7 @@ def test_equal_plans_notice_one_bit(tasks):
 
 def test_stability_counts_flips_and_what_the_flag_foretells():
     row = Jittered(
-        task=0, scene_id="", goal="", predicate="on", n_objects=4, status="solved",
+        task=0, jitter=0, scene_id="", goal="", predicate="on", n_objects=4, status="solved",
         status_moved="solved", moved=("a",), moved_moved=("a",), ambiguous=False,
         ambiguous_moved=False, same_again=True, labels=2, flips=0,
     )  # fmt: skip
@@ -233,13 +234,13 @@ def test_stability_counts_flips_and_what_the_flag_foretells():
 
 
 def test_jittered_tasks_are_planned_on_moved_scenes(tasks):
-    row = jittered(tasks[1], 3, PlannerConfig())
-    assert row.same_again
-    assert row.status == plan(tasks[1].scene, tasks[1].goal).status
-    moved = jitter(
-        tasks[1].scene, np.random.Generator(np.random.Philox(key=3, counter=[0, 0, 0, 1]))
-    )
-    assert row.moved_moved == plan(moved, tasks[1].goal).moved
+    for k, row in enumerate(jittered(tasks[1], 3, PlannerConfig())):
+        assert row.same_again
+        assert row.status == plan(tasks[1].scene, tasks[1].goal).status
+        moved = jitter(
+            tasks[1].scene, np.random.Generator(np.random.Philox(key=3, counter=[0, 0, k, 1]))
+        )
+        assert row.moved_moved == plan(moved, tasks[1].goal).moved
 
 
 # -- the parts -------------------------------------------------------------------------------------
@@ -248,7 +249,7 @@ def test_jittered_tasks_are_planned_on_moved_scenes(tasks):
 def test_planning_measures_every_task_and_replays_every_plan(tasks, tmp_path):
     heard = []
     measured = measure_planning(tasks[:10], progress=lambda *step: heard.append(step))
-    assert heard == [(done, 10) for done in range(1, 11)]
+    assert heard == [(done, 30) for done in range(1, 31)]
     for row, task in zip(measured.rows, tasks, strict=False):
         assert (row.task, row.scene_id) == (task.index, task.scene.id)
         assert 0 < row.cpu_pose + row.cpu_keyframe + row.cpu_path < row.cpu < 5
@@ -302,7 +303,7 @@ def test_completeness_and_stability_cover_every_task(tasks):
     small = draw(4, 2, boxes=(3, 4))
     assert [row.task for row in measure_completeness(small).rows] == [0, 1, 2, 3]
     rows = measure_stability(tasks[:3], seed=1).rows
-    assert [row.task for row in rows] == [0, 1, 2]
+    assert [row.task for row in rows] == [i for i in range(3) for _ in range(JITTERS)]
     assert all(row.same_again for row in rows)
 
 

@@ -158,6 +158,28 @@ def test_blocker_beside_the_reference_is_moved():
     assert replay(scene, result.goal, result.phases).ok
 
 
+def test_a_decision_that_a_tenth_of_a_millimetre_turns_is_flagged():
+    """A neighbour that leaves the finger just enough room, or just not."""
+
+    def beside(gap):
+        red = box("red", 0.0, 0.25, RED, size=(0.11, 0.05, 0.06))  # one grasp: fingers along y
+        green = box("green", 0.0, 0.30 + gap, GREEN)
+        result = plan(replace(OPEN, objects=(red, green, OPEN["blue"])), "on-the-right(red, blue)")
+        assert result.status == "solved"
+        return result
+
+    blocking, free = 0.006, 0.06
+    assert beside(blocking).moved == ("green", "red")
+    assert beside(free).moved == ("red",)
+    while free - blocking > 1e-4:
+        middle = (free + blocking) / 2
+        blocking, free = (blocking, middle) if beside(middle).moved == ("red",) else (middle, free)
+    assert beside(blocking).ambiguous
+    assert beside(free).ambiguous
+    assert not beside(blocking - 0.002).ambiguous
+    assert not beside(free + 0.002).ambiguous
+
+
 def test_reference_moves_only_when_nothing_else_helps():
     # The region behind blue is off the table until blue comes nearer.
     scene = Scene(

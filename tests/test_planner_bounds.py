@@ -243,7 +243,7 @@ def test_banded_solve_equals_dense():
 
 def test_path_gradient_equals_finite_differences():
     arm, rng = panda(), np.random.default_rng(6)
-    body = keyframes.bodies(arm, 0.03)
+    body = keyframes.bodies(0.03)
     obstacles = obstacle_rows(
         [[0.1, 0.0, 0.06, 0.3, 0.05, 0.04, 0.06], [0, 0, -0.05, 0, 0.4, 0.6, 0.05]]
     )
@@ -290,24 +290,25 @@ def test_smoothness_is_the_hessian_of_the_cost():
     np.testing.assert_allclose(found, expected)
 
 
-def test_steps_called_clear_are_clear_at_every_substep():
-    """The dense check skips steps by a bound on the motion; sampled finely, none comes close."""
+def test_pairs_called_clear_are_clear_at_every_substep():
+    """The dense check skips pairs by a bound on the motion; sampled finely, none comes close."""
     arm, at, rng = panda(), arm_at(BASE), np.random.default_rng(8)
-    body = keyframes.bodies(arm, 0.03, (np.array([0, 0, 0.12]), np.array([0.03, 0.02, 0.05])))
+    body = keyframes.bodies(0.03, (np.array([0, 0, 0.12]), np.array([0.03, 0.02, 0.05])))
     obstacles = obstacle_rows(
         [[0.1, 0.0, 0.06, 0.3, 0.05, 0.04, 0.06], [0, 0, -0.05, 0, 0.4, 0.6, 0.05]]
     )
     out, clear, q = np.zeros((len(body.link), len(obstacles))), 0, np.zeros(ARM)
-    while clear < 100:
+    pairs, skipped = np.zeros((out.size, 2), np.int64), 0
+    while clear < 100 or skipped < 1000:
         target = np.r_[rng.uniform(-0.2, 0.2, 2), rng.uniform(0.15, 0.4), rng.uniform(-3, 3)]
         if not hand_down(target, BASE, arm.lower, arm.upper, q):
             continue
         step = rng.normal(scale=0.08, size=ARM)
-        if not path._clear(at, q, q + step, body, obstacles):
-            continue
-        clear += 1
+        n = path.close_pairs(at, q, q + step, body, obstacles, pairs)
+        clear, skipped = clear + (n == 0), skipped + out.size - n
         for share in np.linspace(0, 1, 21):
             path.distances(at, q + share * step, body, obstacles, out)
+            out[tuple(pairs[:n].T)] = 1.0
             assert out.min() >= path.CLEARANCE
 
 
@@ -333,7 +334,7 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
         near, far = reach_interval(0.15)
         pose = np.zeros(3)
         common = (0.0, grasp.parts, obstacles, table, BASE, near, far)
-        status, _ = placement.find_pose(region, np.zeros(2), *common, pose)
+        status, _ = placement.find_pose(region, np.zeros(2), *common, 0.0, pose)
         c, s = math.cos(0.2), math.sin(0.2)
         grid = max(
             placement.slack(c * x - s * y, s * x + c * y, angle, *common)

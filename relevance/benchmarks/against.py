@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from relevance.benchmarks import plots
-from relevance.benchmarks.planned import DEFAULTS, planned
+from relevance.benchmarks.planned import DEFAULTS, planned, replayed
 from relevance.benchmarks.summary import (
     TIMES,
     Measured,
@@ -64,8 +64,9 @@ def measure_against(
     rows = []
     for done, task in enumerate(tasks, 1):
         theirs = peer(task.scene, task.goal) if done % 2 else None
-        ours = planned(task, config)
+        ours, plan = planned(task, config)
         theirs = theirs or peer(task.scene, task.goal)
+        ours = replayed(ours, task, plan)
         solved = theirs.status == "solved"
         verdict = replay(task.scene, task.goal, theirs.phases) if solved else None
         rows.append(

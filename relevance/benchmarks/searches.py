@@ -20,9 +20,11 @@ SIZES = (3, 5, 10, 15, 20, 30)
 """Numbers of boxes that scaling looks at."""
 MAX_EDGE = 0.09
 """Longest edge of the boxes that scaling draws, m: thirty longer ones hardly fit in reach."""
-NODE_LIMIT = 100_000
+NODE_LIMIT = 1_000_000
 """Most nodes that scaling gives a search for one goal: a cap that no clock decides."""
-CAPPED = replace(DEFAULTS, node_limit=NODE_LIMIT)
+MOST_ACTIONS = 12
+"""Longest plans that scaling looks for."""
+CAPPED = replace(DEFAULTS, node_limit=NODE_LIMIT, max_actions=MOST_ACTIONS)
 COUNTERS = ("nodes", "pose_checks", "keyframe_nlps", "path_nlps")
 
 
@@ -74,7 +76,7 @@ def measure_searches(
     warm_up()
     pairs = []
     for done, task in enumerate(tasks, 1):
-        by = {name: planned(task, _with(config, name), judge=False) for name in SEARCHES}
+        by = {name: planned(task, _with(config, name))[0] for name in SEARCHES}
         pairs.append(_pair(task, by))
         progress(done, len(tasks))
     tables = [agreement_table(pairs), counters_table(pairs)]
@@ -95,12 +97,12 @@ def measure_scaling(
     rows: list[Planned] = []
     total = len(SEARCHES) * sum(map(len, tasks.values()))
     for task, search in _turns(tasks):
-        rows.append(planned(task, _with(config, search), judge=False))
+        rows.append(planned(task, _with(config, search))[0])
         progress(len(rows), total)
     return Measured(
         name="scaling",
         rows=tuple(rows),
-        tables=(scaling_table(rows, config.node_limit),),
+        tables=(scaling_table(rows, config),),
         plots=(Plot(name="scaling", draw=partial(plots.scaling, rows=rows), panels=3),),
     )
 
@@ -171,7 +173,7 @@ def counters_table(pairs: Sequence[Pair]) -> Table:
     return Table(name="counters", title="Work a task, mean", columns=columns, rows=tuple(lines))
 
 
-def scaling_table(rows: Sequence[Planned], node_limit: int) -> Table:
+def scaling_table(rows: Sequence[Planned], config: PlannerConfig) -> Table:
     """Time, nodes and outcome by search and number of boxes."""
     lines = []
     for search in SEARCHES:
@@ -184,6 +186,7 @@ def scaling_table(rows: Sequence[Planned], node_limit: int) -> Table:
                     boxes,
                     len(some),
                     *(sum(r.status == s for r in some) for s in ("solved", "infeasible", "limit")),
+                    sum(row.n_actions > DEFAULTS.max_actions for row in some),
                     f"{interval(times, 'median'):.1f}",
                     f"{interval(times, 'mean'):.1f}",
                     f"{max(times):.0f}",
@@ -192,10 +195,14 @@ def scaling_table(rows: Sequence[Planned], node_limit: int) -> Table:
                 )
             )
     columns = (
-        "search", "boxes", "tasks", "solved", "infeasible", "limit", "CPU ms, median",
-        "CPU ms, mean", "CPU ms, max", "nodes, median", "nodes, mean",
+        "search", "boxes", "tasks", "solved", "infeasible", "limit",
+        f"over {DEFAULTS.max_actions} actions", "CPU ms, median", "CPU ms, mean", "CPU ms, max",
+        "nodes, median", "nodes, mean",
     )  # fmt: skip
-    title = f"Growth with the number of boxes (at most {node_limit} nodes a goal)"
+    title = (
+        f"Growth with the number of boxes (up to {config.max_actions} actions, at most "
+        f"{config.node_limit} nodes a goal)"
+    )
     return Table(name="scaling", title=title, columns=columns, rows=tuple(lines))
 
 

@@ -1,9 +1,12 @@
-"""Stability: every box moved by 0.1 mm at random, the task planned again, labels compared."""
+"""Stability: every box moved by 0.1 mm at random, the task planned again, labels compared.
+
+Flips are rare, so every task is jittered several times.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,14 +20,17 @@ from relevance.statistics import Table
 
 JITTER = 1e-4
 """How far each box is moved, m, in a direction of its own."""
+JITTERS = 5
+"""How often each task is jittered."""
 _DRAWS = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Jittered:
-    """One task planned twice: as it is, and with every box moved by JITTER."""
+    """One task planned as it is, and with every box moved by JITTER."""
 
     task: int
+    jitter: int
     scene_id: str
     goal: str
     predicate: str
@@ -60,7 +66,7 @@ def measure_stability(
     warm_up()
     rows = []
     for done, task in enumerate(tasks, 1):
-        rows.append(jittered(task, seed, config))
+        rows += jittered(task, seed, config)
         progress(done, len(tasks))
     tables = [stability_table(rows)]
     silent = [row for row in rows if row.flipped and not row.ambiguous]
@@ -69,31 +75,33 @@ def measure_stability(
     return Measured(name="stability", rows=tuple(rows), tables=tuple(tables))
 
 
-def jittered(task: Task, seed: int, config: PlannerConfig) -> Jittered:
-    """Plan a task as it is, again, and with its boxes moved."""
+def jittered(task: Task, seed: int, config: PlannerConfig) -> Iterator[Jittered]:
+    """Plan a task as it is, again, and JITTERS times with its boxes moved."""
     first = plan(task.scene, task.goal, config=config)
     again = plan(task.scene, task.goal, config=config)
-    rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 0, task.index]))
-    moved = plan(jitter(task.scene, rng), task.goal, config=config)
     queries = [n for n in task.scene.names if n not in (task.goal.subject, task.goal.reference)]
-    comparable = first.status == moved.status == "solved"
-    flips = [name for name in queries if (name in first.moved) != (name in moved.moved)]
-    return Jittered(
-        task=task.index,
-        scene_id=task.scene.id,
-        goal=str(task.goal),
-        predicate=task.goal.predicate.value,
-        n_objects=task.n_objects,
-        status=first.status,
-        status_moved=moved.status,
-        moved=first.moved,
-        moved_moved=moved.moved,
-        ambiguous=first.ambiguous,
-        ambiguous_moved=moved.ambiguous,
-        same_again=equal_plans(first, again),
-        labels=len(queries) if comparable else 0,
-        flips=len(flips) if comparable else 0,
-    )
+    for draw in range(JITTERS):
+        rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, draw, task.index]))
+        moved = plan(jitter(task.scene, rng), task.goal, config=config)
+        comparable = first.status == moved.status == "solved"
+        flips = [name for name in queries if (name in first.moved) != (name in moved.moved)]
+        yield Jittered(
+            task=task.index,
+            jitter=draw,
+            scene_id=task.scene.id,
+            goal=str(task.goal),
+            predicate=task.goal.predicate.value,
+            n_objects=task.n_objects,
+            status=first.status,
+            status_moved=moved.status,
+            moved=first.moved,
+            moved_moved=moved.moved,
+            ambiguous=first.ambiguous,
+            ambiguous_moved=moved.ambiguous,
+            same_again=equal_plans(first, again),
+            labels=len(queries) if comparable else 0,
+            flips=len(flips) if comparable else 0,
+        )
 
 
 def jitter(scene: Scene, rng: np.random.Generator) -> Scene:
@@ -157,7 +165,7 @@ def stability_table(rows: Sequence[Jittered]) -> Table:
     )
     return Table(
         name="stability",
-        title=f"Stability: every box moved by {1e3 * JITTER:g} mm",
+        title=f"Stability: every box moved by {1e3 * JITTER:g} mm, {JITTERS} times a task",
         columns=("what", "found"),
         rows=lines,
     )

@@ -12,6 +12,7 @@ Variables: q (2m, 7), one per switch (pick and place of each of m moved boxes in
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ from relevance.planner.kernels.boxes import (
     separation,
     upright,
 )
-from relevance.planner.kinematics import ARM, FRAME, HAND, Panda, look_at_frames, look_at_grasp
+from relevance.planner.kinematics import ARM, FRAME, HAND, look_at_frames, look_at_grasp, panda
 
 CLEARANCE = 0.0025
 """Clearance asked of every pair at a switch, m (the pose bound's MARGIN is larger)."""
@@ -73,24 +74,30 @@ class Switches(NamedTuple):
     """(m, 2) bounds of |x| and |y| of each placement."""
 
 
-def bodies(arm: Panda, opening: float, carried: tuple | None = None) -> Bodies:
+def bodies(opening: float, carried: tuple | None = None) -> Bodies:
     """Arm, hand and fingers at this opening; last the carried box (centre, half), if any."""
-    rows = list(arm.arm)
+    shut, sides = _shut_hand()
+    count = len(sides) - (carried is None)
+    link, centre, half, radius = (rows[:count].copy() for rows in shut)
+    centre[:, 1] += opening * sides[:count]
+    if carried is not None:
+        centre[-1], half[-1] = carried
+        radius[-1] = math.hypot(*half[-1])
+    return Bodies(link, centre, half, radius)
+
+
+@cache
+def _shut_hand() -> tuple[Bodies, np.ndarray]:
+    """Arm, hand, fingers at opening 0 and room for a box; and which way opening moves each in y."""
+    arm = panda()
+    rows, sides = list(arm.arm), [0.0] * len(arm.arm)
     for low, high in arm.finger:
         for side in (1.0, -1.0):
-            centre, half = (low + high) / 2, (high - low) / 2
-            rows.append(
-                (HAND, np.array([centre[0], side * (centre[1] + opening), centre[2]]), half)
-            )
-    if carried is not None:
-        rows.append((HAND, *carried))
-    half = np.array([row[2] for row in rows])
-    return Bodies(
-        link=np.array([row[0] for row in rows]),
-        centre=np.array([row[1] for row in rows]),
-        half=half,
-        radius=np.sqrt((half**2).sum(1)),
-    )
+            rows.append((HAND, (low + high) / 2 * [1.0, side, 1.0], (high - low) / 2))
+            sides.append(side)
+    rows.append((HAND, np.zeros(3), np.zeros(3)))
+    link, centre, half = (np.array(column) for column in zip(*rows, strict=True))
+    return Bodies(link, centre, half, np.sqrt((half**2).sum(1))), np.array([*sides, 0.0])
 
 
 @njit(cache=True)

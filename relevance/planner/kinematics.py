@@ -112,8 +112,13 @@ def look_at_grasp(arm, q, target):
 
 
 @njit(cache=True)
-def finger_angle(arm, q):
-    """Direction of the downward hand's finger axis (its y) in the world, rad."""
+def finger_turn(arm, q0, q1):
+    """By how much the downward hand's finger axis (its y) turns from q0 to q1, rad."""
+    return _finger_angle(arm, q1) - _finger_angle(arm, q0)
+
+
+@njit(cache=True)
+def _finger_angle(arm, q):
     look_at_frames(arm, q)
     axis = HAND * FRAME + 3 + 1
     return math.atan2(arm.frames_y[axis + 3], arm.frames_y[axis])

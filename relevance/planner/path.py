@@ -44,6 +44,8 @@ FAR = 0.01
 """Distances beyond this are not computed, m."""
 SMALL_STEP = 2e-3
 """Gauss-Newton stops after a step below this, rad; what is left is of the order of its square."""
+ROUGH_STEP = 1e-2
+"""The same before the multipliers are set for the first time, rad."""
 TOLERANCE = 4e-4
 """Largest violation of a solved problem, m or rad."""
 _WIDTH = 3 * ARM
@@ -217,7 +219,7 @@ def solve(X, arm, bodies, obstacles, margin, samples, n_samples, targets):
     eq, limit = np.zeros((T + 1, 6)), np.zeros((T + 1, ARM, 2))
     ineq = np.zeros((len(samples), len(bodies.link), len(obstacles)))
     old, step = X.copy(), np.zeros(n)
-    mu, gain, worst = 500.0, 0.0, 1e9
+    mu, gain, worst = 1000.0, 0.0, 1e9
     for outer in range(8):
         merit, worst = assemble(
             X, arm, bodies, obstacles, margin, samples, n_samples, targets, smooth, eq, ineq, limit,
@@ -247,11 +249,11 @@ def solve(X, arm, bodies, obstacles, margin, samples, n_samples, targets):
                     break
                 scale *= 0.4
             merit = new
-            if scale * longest < SMALL_STEP:
+            if scale * longest < (SMALL_STEP if outer else ROUGH_STEP):
                 break
         if worst < TOLERANCE and outer > 0:
             return worst
-        mu, gain = min(mu * 4.0, 1e5), mu
+        mu, gain = min(mu * 10.0, 1e5), mu
     return worst
 
 
@@ -259,38 +261,43 @@ def solve(X, arm, bodies, obstacles, margin, samples, n_samples, targets):
 def dense_check(X, arm, bodies, obstacles, margin, broken):
     """Worst penetration (m, 0 if none) over all sub-steps of the rows X.
 
-    Steps that are clear of everything are not looked at more closely.
+    Pairs that stay clear of each other during a step are not looked at more closely.
     Fills broken (T, 2) for each step: the sub-step share where its margin is broken most, and
     by how much (m, 0 if kept).
     """
-    out = np.zeros((len(bodies.link), len(obstacles)))
-    worst = 0.0
+    pairs = np.zeros((len(bodies.link) * len(obstacles), 2), np.int64)
+    p, R, normal, contact = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    q, worst = np.zeros(ARM), 0.0
     broken[:, :] = 0.0
-    q = np.zeros(ARM)
     for t in range(len(X) - 1):
-        if _clear(arm, X[t], X[t + 1], bodies, obstacles):
-            continue
-        for k in range(SUBSTEPS + 1):
+        n = close_pairs(arm, X[t], X[t + 1], bodies, obstacles, pairs)
+        for k in range(SUBSTEPS + 1 if n else 0):
             share = k / SUBSTEPS
             for i in range(ARM):
                 q[i] = (1 - share) * X[t, i] + share * X[t + 1, i]
-            distances(arm, q, bodies, obstacles, out)
-            for b in range(len(bodies.link)):
-                for w in range(len(obstacles)):
-                    worst = max(worst, -out[b, w])
-                    short = margin[b, w] - out[b, w]
-                    if short > broken[t, 1]:
-                        broken[t, 0], broken[t, 1] = share, short
+            look_at_frames(arm, q)
+            before = -1
+            for i in range(n):
+                b, w = pairs[i]
+                if b != before:
+                    at = bodies.link[b] * FRAME
+                    body_pose(arm.frames_y[at : at + FRAME], bodies.centre[b], p, R)
+                    before = b
+                gap = separation(p, R, bodies.half[b], obstacles[w], normal, contact)
+                worst = max(worst, -gap)
+                if margin[b, w] - gap > broken[t, 1]:
+                    broken[t, 0], broken[t, 1] = share, margin[b, w] - gap
     return worst
 
 
 @njit(cache=True)
-def _clear(arm, q0, q1, bodies, obstacles):
-    """Whether everything stays CLEARANCE apart all the way, by how far bodies move from half-way.
+def close_pairs(arm, q0, q1, bodies, obstacles, pairs):
+    """Which bodies may come within CLEARANCE of which obstacles on the way from q0 to q1.
 
-    The motion is bounded to first order, with a quarter to spare for the rest.
+    By their distance half-way and how far each body moves from there, to first order with a
+    quarter to spare for the rest. Fills pairs (B W, 2), body by body; returns how many.
     """
-    q = np.zeros(ARM)
+    q, count = np.zeros(ARM), 0
     for i in range(ARM):
         q[i] = 0.5 * (q0[i] + q1[i])
     p, R, normal, contact = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
@@ -313,17 +320,25 @@ def _clear(arm, q0, q1, bodies, obstacles):
             if not near(p, bodies.radius[b] + reach, obstacles[w]):
                 continue
             if separation(p, R, bodies.half[b], obstacles[w], normal, contact) < reach:
-                return False
-    return True
+                pairs[count, 0], pairs[count, 1] = b, w
+                count += 1
+    return count
 
 
 @njit(cache=True)
 def motion(X, arm, leave, leaving, arrive, bodies, obstacles):
-    """Fill the rows X (ROWS + 1, 7) between its first and last; returns the worst penetration.
+    """Fill the rows X (ROWS + 1, 7) between its first and last.
 
     leave / arrive: hand targets (4,) of the two switches; without `leaving` the motion starts
-    free. Returns -1 where no motion was found that keeps the dense check within ALLOWED.
+    free. Returns the worst penetration (m; -1 where no motion was found that keeps the dense
+    check within ALLOWED), the cost (rad^2) and the time between rows (s).
     """
+    depth = _motion(X, arm, leave, leaving, arrive, bodies, obstacles)
+    return depth, acceleration_cost(X), time_step(arm, X)
+
+
+@njit(cache=True)
+def _motion(X, arm, leave, leaving, arrive, bodies, obstacles):
     shape = (len(bodies.link), len(obstacles))
     first, last = np.zeros(shape), np.zeros(shape)
     distances(arm, X[0], bodies, obstacles, first)
@@ -427,7 +442,8 @@ def _column(X, arm, q, switch, row, direction, safe, targets):
 def retreat(X, arm, leave, bodies, obstacles):
     """Fill the rows X (2 * VERTICAL + 1, 7) after its first: straight up from a release, to rest.
 
-    Returns the worst penetration (m), or -1 out of reach.
+    Returns the worst penetration (m; -1 out of reach), the cost (rad^2) and the time between
+    rows (s).
     """
     steps = len(X) - 1
     target = leave.copy()
@@ -436,9 +452,10 @@ def retreat(X, arm, leave, bodies, obstacles):
         target[2] = leave[2] + RISE * share * share * (3 - 2 * share)
         X[t] = X[t - 1]
         if not reach_to(arm, X[t], target) or not _within_limits(arm, X[t]):
-            return -1.0
+            return -1.0, 0.0, 0.0
     margin = np.zeros((len(bodies.link), len(obstacles)))
-    return dense_check(X, arm, bodies, obstacles, margin, np.zeros((steps, 2)))
+    depth = dense_check(X, arm, bodies, obstacles, margin, np.zeros((steps, 2)))
+    return depth, acceleration_cost(X), time_step(arm, X)
 
 
 @njit(cache=True)

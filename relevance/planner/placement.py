@@ -28,6 +28,8 @@ DEPTH = 0.025
 """How far the finger tips reach below the top of the box that they hold, m."""
 SPREAD = 0.005
 """How far each finger stands off the box before it closes, m."""
+EDGE = 2e-4
+"""A decision that turns over when something stands this much elsewhere is a close one, m."""
 COMFORT = 0.008
 """Clearance beyond MARGIN with which a pose is taken at once, m."""
 NODE_LIMIT = 4000
@@ -38,7 +40,7 @@ LIFT = 0.08
 FOUND, NONE, UNDECIDED = 1, 0, 2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Grasp:
     """The hand pointing down over a box, fingers along its x (axis 0) or y (axis 1)."""
 
@@ -118,8 +120,9 @@ def obstacle(box: Box) -> np.ndarray:
 def pick_blockers(i, axis, parts, obstacles, blocking):
     """Fill blocking (N,) bool: which boxes are in the way of taking box i with this grasp.
 
-    obstacles (N, UPRIGHT): all the boxes.
+    obstacles (N, UPRIGHT): all the boxes. Returns how close the closest decision was, m.
     """
+    closest = 1.0
     o = obstacles[i]
     angle = o[3] + axis * math.pi / 2
     bottom, top = o[2] - o[6], o[2] + o[6]
@@ -128,10 +131,12 @@ def pick_blockers(i, axis, parts, obstacles, blocking):
         blocking[k] = False
         if k == i:
             continue
-        if clearance(o[0], o[1], angle, bottom, parts[1:], other) < PICK_MARGIN:
-            blocking[k] = True
-        elif other[0, 2] - other[0, 6] >= top - 2e-3:  # what overhangs the box blocks the way up
-            blocking[k] = clearance(o[0], o[1], angle, top, parts[:1], other) < 0
+        gap = clearance(o[0], o[1], angle, bottom, parts[1:], other) - PICK_MARGIN
+        if other[0, 2] - other[0, 6] >= top - 2e-3:  # what overhangs the box blocks the way up
+            gap = min(gap, clearance(o[0], o[1], angle, top, parts[:1], other))
+        blocking[k] = gap < 0
+        closest = min(closest, abs(gap))
+    return closest
 
 
 @njit(cache=True)
@@ -186,13 +191,14 @@ def slack(x, y, angle, bottom, parts, obstacles, table, base, near, far):
 
 
 @njit(cache=True)
-def find_pose(region, prefer, bottom, parts, obstacles, table, base, near, far, pose):
+def find_pose(region, prefer, bottom, parts, obstacles, table, base, near, far, ease, pose):
     """Branch and bound for a free pose whose centre lies in a rectangle.
 
-    region: centre x, y, angle, half extents (5,). prefer (x, y): where to look first. Fills
+    region: centre x, y, angle, half extents (5,). prefer (x, y): where to look first. ease: how
+    much every constraint is relaxed, m. Fills
     pose (x, y, angle of the finger axis) with the first comfortable pose of the coarsest level
-    that has a free one, or the clearest of that level. Returns (FOUND | NONE | UNDECIDED,
-    evaluations).
+    that has a free one, or the clearest of that level. Returns (FOUND | NONE | UNDECIDED, its
+    slack in m).
     """
     a, b = region[3], region[4]
     c, s = math.cos(region[2]), math.sin(region[2])
@@ -225,6 +231,7 @@ def find_pose(region, prefer, bottom, parts, obstacles, table, base, near, far, 
             x = region[0] + c * cells[n, 0] - s * cells[n, 1]
             y = region[1] + s * cells[n, 0] + c * cells[n, 1]
             value = slack(x, y, cells[n, 2], bottom, parts, obstacles, table, base, near, far)
+            value += ease
             evaluations += 1
             keep[n] = value + lipschitz >= 0
             if value > best:
@@ -234,12 +241,12 @@ def find_pose(region, prefer, bottom, parts, obstacles, table, base, near, far, 
             if best >= COMFORT:
                 break
         if best >= 0:
-            return FOUND, evaluations
+            return FOUND, best
         alive = cells[keep]
         if len(alive) == 0:
-            return NONE, evaluations
+            return NONE, best
         if level == MAX_LEVEL or evaluations + 8 * len(alive) > NODE_LIMIT + count:
-            return UNDECIDED, evaluations
+            return UNDECIDED, best
         hx, hy, ha = hx / 2, hy / 2, ha / 2
         cells = np.empty((8 * len(alive), 3))
         for n in range(len(alive)):
@@ -247,4 +254,4 @@ def find_pose(region, prefer, bottom, parts, obstacles, table, base, near, far, 
                 cells[8 * n + child, 0] = alive[n, 0] + (hx if child & 1 else -hx)
                 cells[8 * n + child, 1] = alive[n, 1] + (hy if child & 2 else -hy)
                 cells[8 * n + child, 2] = alive[n, 2] + (ha if child & 4 else -ha)
-    return UNDECIDED, evaluations
+    return UNDECIDED, best

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import compress
 
 import numpy as np
 
@@ -20,13 +21,13 @@ from relevance.planner.kinematics import (
     HOME,
     Arm,
     arm_at,
-    finger_angle,
+    finger_turn,
     hand_down,
     panda,
     reach_interval,
 )
-from relevance.planner.placement import FOUND, UNDECIDED, Grasp
-from relevance.scene import Action, Box, Goal, Phase, Pose, Predicate, Scene, region
+from relevance.planner.placement import EDGE, FOUND, NONE, UNDECIDED, Grasp
+from relevance.scene import Box, Goal, Phase, Pose, Predicate, Scene, region
 
 REGION_MARGIN = 0.001
 """How far inside the goal region a subject is placed, m."""
@@ -89,19 +90,17 @@ class Problem:
     counts: Counts = field(default_factory=Counts)
     seconds: Seconds = field(default_factory=Seconds)
     undecided: bool = False
-    """Whether a pose bound was left open on the way: the row is flagged ambiguous."""
+    """Whether a pose bound was left open on the way, or decided by less than `placement.EDGE`:
+    the row is flagged ambiguous."""
     boxes: dict[str, Box] = field(init=False)
-    grasps: dict[str, tuple[Grasp, ...]] = field(init=False)
-    blockers: dict[str, tuple[frozenset[str], ...]] = field(init=False)
-    """Per object and grasp: who must have left before it can be picked that way."""
     above: dict[str, frozenset[str]] = field(init=False)
     obstacles: np.ndarray = field(init=False)
     """(N + 2, UPRIGHT): the boxes as they stand at first, then the table and the robot's foot."""
     arm: Arm = field(init=False)
+    _blockers: dict[str, dict[Grasp, frozenset[str]]] = field(init=False, default_factory=dict)
     _memo: dict = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        began = time.process_time()
         self.boxes = {box.name: box for box in self.scene.objects}
         self.index = {name: i for i, name in enumerate(self.boxes)}
         self.arm = arm_at(np.array([*self.scene.robot.base, self.scene.robot.yaw]))
@@ -109,20 +108,6 @@ class Problem:
         standing = [placement.obstacle(box) for box in self.scene.objects]
         self.obstacles = np.array([*standing, *self._fixtures()])
         self.above = logic.stacked_on(self.scene)
-        self.grasps, self.blockers = {}, {}
-        blocking = np.zeros(len(standing), np.bool_)
-        for i, (name, box) in enumerate(self.boxes.items()):
-            self.grasps[name] = tuple(g for g in placement.grasps(box) if self._reachable(box, g))
-            sets = []
-            for grasp in self.grasps[name]:
-                placement.pick_blockers(
-                    i, grasp.axis, grasp.parts, self.obstacles[: len(standing)], blocking
-                )
-                names = zip(self.boxes, blocking, strict=True)
-                sets.append(frozenset(other for other, bad in names if bad))
-            self.blockers[name] = tuple(sets)
-        self.counts.pose += len(self.boxes)
-        self.seconds.pose += time.process_time() - began
 
     def _fixtures(self) -> list[np.ndarray]:
         """What always stands there, as obstacles: the table and the robot's foot."""
@@ -141,7 +126,7 @@ class Problem:
 
     def _interval(self, bottom: float, box: Box, grasp: Grasp) -> tuple[float, float]:
         """Reach (near, far) for holding the box with its underside at this height, liftably."""
-        z = bottom + box.size[2] / 2 + grasp.above - self.arm.base[2]
+        z = bottom + box.size[2] / 2 + grasp.above - self.scene.robot.base[2]
         # Heights in whole millimetres, to compute each once; REACH_MARGIN covers the rest.
         near, far = reach_interval(round(z, 3))
         near_up, far_up = reach_interval(round(z + placement.LIFT, 3))
@@ -149,19 +134,39 @@ class Problem:
 
     def _reachable(self, box: Box, grasp: Grasp) -> bool:
         near, far = self._interval(box.bottom, box, grasp)
-        base = self.arm.base
+        base = self.scene.robot.base
         r = math.hypot(box.position[0] - base[0], box.position[1] - base[1])
+        self.undecided |= min(abs(r - near), abs(r - far)) < EDGE
         return near <= r <= far
 
     # -- pose bound ---------------------------------------------------------------------------
+
+    def blockers(self, name: str) -> dict[Grasp, frozenset[str]]:
+        """The grasps of an object, and who must have left before it can be picked that way."""
+        if name not in self._blockers:
+            began = time.process_time()
+            self.counts.pose += 1
+            i, box, found = self.index[name], self.boxes[name], {}
+            boxes, blocking = self.obstacles[: len(self.boxes)], np.zeros(len(self.boxes), np.bool_)
+            for grasp in placement.grasps(box):
+                if self._reachable(box, grasp):
+                    gap = placement.pick_blockers(i, grasp.axis, grasp.parts, boxes, blocking)
+                    self.undecided |= gap < EDGE
+                    found[grasp] = frozenset(compress(self.boxes, blocking.tolist()))
+            self._blockers[name] = found
+            self.seconds.pose += time.process_time() - began
+        return self._blockers[name]
+
+    def grasps(self, name: str) -> tuple[Grasp, ...]:
+        """The grasps with which an object can be reached where it stands at first."""
+        return tuple(self.blockers(name))
 
     def pickable(self, name: str, gone: frozenset[str]) -> tuple[Grasp, ...]:
         """Grasps with which the object can be taken once the objects in `gone` have left."""
         self.counts.pose += 1
         if not self.above[name] <= gone:
             return ()
-        pairs = zip(self.grasps[name], self.blockers[name], strict=True)
-        return tuple(grasp for grasp, blocking in pairs if blocking <= gone)
+        return tuple(grasp for grasp, who in self.blockers(name).items() if who <= gone)
 
     def goal_pose(
         self, gone: frozenset[str], grasp: Grasp, reference: Box
@@ -200,14 +205,19 @@ class Problem:
         self.counts.pose += 1
         near, far = self._interval(bottom, box, grasp)
         pose = np.zeros(3)
-        status, _ = placement.find_pose(
-            area, np.array(prefer), bottom, grasp.parts, obstacles, self.table, self.arm.base,
-            near, far, pose,
-        )  # fmt: skip
+
+        def find(ease: float) -> tuple[int, float]:
+            return placement.find_pose(
+                area, np.array(prefer), bottom, grasp.parts, obstacles, self.table, self.arm.base,
+                near, far, ease, pose,
+            )  # fmt: skip
+
+        status, slack = find(0.0)
+        found = (float(pose[0]), float(pose[1]), float(pose[2])) if status == FOUND else None
+        close = slack < EDGE if found else status == UNDECIDED or find(EDGE)[0] != NONE
+        self.undecided |= close
         self.seconds.pose += time.process_time() - began
-        if status == UNDECIDED:
-            self.undecided = True
-        return (float(pose[0]), float(pose[1]), float(pose[2])) if status == FOUND else None
+        return found
 
     def place_all(self, order: tuple[str, ...], grasp: Grasp) -> list[Placement] | None:
         """Poses for every moved box: first the subject's, then the others' around it.
@@ -262,7 +272,7 @@ class Problem:
                 prefer, reserved = reference.position[:2], kept[:0]  # kept was laid out around it
                 area = np.array([*prefer, 0.0, 0.002, 0.002])
             elif reference.name in order[i:]:
-                grasp = self.grasps[reference.name][0]
+                grasp = self.grasps(reference.name)[0]
                 pose = (*reference.position[:2], reference.yaw + grasp.axis * math.pi / 2)
                 there = placement.volumes(grasp.parts, pose, 0.0, reference.top, SKY)
                 reserved = np.vstack([kept, there])
@@ -285,7 +295,7 @@ class Problem:
         """Where the gripper will be when it takes these boxes."""
         found = []
         for name in names:
-            box, grasp = self.boxes[name], self.grasps[name][0]
+            box, grasp = self.boxes[name], self.grasps(name)[0]
             x, y, _, angle = self.pick_target(box, grasp)
             found.append(placement.volumes(grasp.parts, (x, y, angle), box.bottom, 0.0, SKY)[1:])
         return found
@@ -362,7 +372,7 @@ class Problem:
         key = (name, grasp.axis, holding, opening)
         if key not in self._memo:
             carried = _carried(self.boxes[name], grasp) if holding else None
-            self._memo[key] = keyframes.bodies(panda(), opening, carried)
+            self._memo[key] = keyframes.bodies(opening, carried)
         return self._memo[key]
 
     def pick_target(self, box: Box, grasp: Grasp) -> np.ndarray:
@@ -406,15 +416,17 @@ class Problem:
                 there[i] = k == 0
                 X = np.empty((path.ROWS + 1, ARM))
                 X[0], X[-1] = at, q[2 * j + k]
-                depth = path.motion(X, self.arm, leave, leaving, arrive, body, obstacles[there])
+                depth, effort, dt = path.motion(
+                    X, self.arm, leave, leaving, arrive, body, obstacles[there]
+                )
                 if depth < 0:
                     return None
                 action, carried = sequence[2 * j + k], name if k else None
-                phases.append(self._phase(X, action, opening, carried))
-                cost, worst = cost + path.acceleration_cost(X), max(worst, depth)
+                phases.append(Phase(action=action, q=X, dt=dt, opening=opening, carried=carried))
+                cost, worst = cost + effort, max(worst, depth)
                 at, leave, leaving = X[-1], arrive, True
             there[i] = True
-            turned = finger_angle(self.arm, q[2 * j + 1]) - finger_angle(self.arm, q[2 * j])
+            turned = finger_turn(self.arm, q[2 * j], q[2 * j + 1])
             yaw = (box.yaw + turned + math.pi) % (2 * math.pi) - math.pi
             position = (float(poses[j, 0]), float(poses[j, 1]), bottom + box.size[2] / 2)
             x, y, z = position
@@ -423,11 +435,11 @@ class Problem:
             final[name] = Pose(position=position, yaw=yaw, on=on)
             X = np.empty((2 * path.VERTICAL + 1, ARM))
             X[0] = at
-            depth = path.retreat(X, self.arm, put, free, obstacles[there])
+            depth, effort, dt = path.retreat(X, self.arm, put, free, obstacles[there])
             if not 0 <= depth <= path.ALLOWED:
                 return None
-            phases.append(self._phase(X, None, grasp.opening, None))
-            cost, worst = cost + path.acceleration_cost(X), max(worst, depth)
+            phases.append(Phase(action=None, q=X, dt=dt, opening=grasp.opening, carried=None))
+            cost, worst = cost + effort, max(worst, depth)
             at, leaving = X[-1], False
         return Motion(
             order=order, phases=tuple(phases), final=final, cost=cost, max_penetration=worst
@@ -445,7 +457,7 @@ class Problem:
             name, holding = motion.order[k // 3], k % 3 == 1
             i = self.index[name]
             opening = "closed" if holding else "opening"
-            grasp = next(g for g in self.grasps[name] if getattr(g, opening) == phase.opening)
+            grasp = next(g for g in self.grasps(name) if getattr(g, opening) == phase.opening)
             there[i] = not holding
             if k % 3 == 2:  # the retreat
                 pose = motion.final[name]
@@ -460,10 +472,6 @@ class Problem:
             depth = path.dense_check(phase.q, self.arm, body, obstacles[there], margin, broken)
             worst = max(worst, depth)
         return worst
-
-    def _phase(self, X, action: Action | None, opening: float, carried: str | None) -> Phase:
-        dt = path.time_step(self.arm, X)
-        return Phase(action=action, q=X, dt=dt, opening=opening, carried=carried)
 
 
 def _underside(rows: np.ndarray) -> np.ndarray:

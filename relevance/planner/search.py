@@ -35,7 +35,7 @@ from relevance.scene import (
     goal_holds,
 )
 
-PLANNER_VERSION = "2"
+PLANNER_VERSION = "3"
 ORDERS = 6
 """How many orders of a set `informed` tries."""
 COST_TOLERANCE = 1e-3
@@ -99,6 +99,8 @@ class PlanResult:
     cost: float = math.nan
     """Squared joint accelerations, summed over rows, rad^2."""
     ambiguous: bool = False
+    """Whether another set of moved objects does as well, a bound was left open or a late one
+    refused, or a box standing 0.2 mm elsewhere might have changed a decision."""
     counts: Counts
     check_ok: bool = False
     max_penetration: float = 0.0
@@ -246,7 +248,7 @@ class _Search:
         problem, goal = self.problem, self.problem.goal
         if goal.subject not in self.allowed:
             return f"{goal.subject} may not be moved"
-        if not problem.grasps[goal.subject]:
+        if not problem.grasps(goal.subject):
             return f"{goal.subject} cannot be grasped: too wide for the hand or out of reach"
         if not (self._within_reach() or self._reference_moves()):
             return "the goal region is out of reach, off the table or too tight for the hand"
@@ -258,13 +260,13 @@ class _Search:
         others = frozenset(problem.boxes) - {goal.subject, goal.reference}
         return any(
             problem.goal_pose(others, grasp, problem.boxes[goal.reference]) is not None
-            for grasp in problem.grasps[goal.subject]
+            for grasp in problem.grasps(goal.subject)
         )
 
     def _reference_moves(self) -> bool:
         reference = self.problem.goal.reference
         allowed = reference in self.allowed and self.config.max_actions >= 4
-        return allowed and bool(self.problem.grasps[reference])
+        return allowed and bool(self.problem.grasps(reference))
 
     def _visit(self) -> None:
         self.problem.counts.nodes += 1
@@ -336,7 +338,7 @@ class _Search:
         """What blocks the picks that a set needs: the subject's by any grasp, and its own."""
         problem, goal = self.problem, self.problem.goal
         needed = [goal.subject, *(n for n in chosen if not problem.pickable(n, chosen))]
-        found = frozenset().union(*(problem.above[name].union(*problem.blockers[name])
+        found = frozenset().union(*(problem.above[name].union(*problem.blockers(name).values())
                                     for name in needed))  # fmt: skip
         return found - {goal.subject}
 
@@ -387,7 +389,7 @@ def beside_goal(problem: Problem) -> frozenset[str]:
     x, y, angle, a, b = problem.goal_region(reference)
     spread = max(
         math.hypot(abs(part[0]) + part[1], part[2])
-        for grasp in problem.grasps[subject.name]
+        for grasp in problem.grasps(subject.name)
         for part in grasp.parts
     )
     area = Box(

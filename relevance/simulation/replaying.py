@@ -41,6 +41,7 @@ _FLAT = 0.01  # tilt of a box that rests, rad
 _EPSILON = 1e-6
 # Links that can meet without being neighbours: the wrist and hand against the lower arm.
 _SELF_PAIRS = {(a, b) for a in (6, _HAND, *_FINGERS) for b in (_BASE, 0, 1, 2, 3)}
+_Bounds = tuple[Sequence[float], Sequence[float]]  # lowest and highest corner, m
 _RENEW_AFTER = 200  # removed bodies leak; a fresh world now and then bounds it
 
 
@@ -122,8 +123,7 @@ class _Arena:
             for link in self.links
             if pybullet.getCollisionShapeData(self.robot, link, physicsClientId=self.client)
         )
-
-        self.may_meet = np.array([[(a, b) in _SELF_PAIRS for b in self.solid] for a in self.solid])
+        self.may_meet = [(a, b) for a in self.solid for b in self.solid if (a, b) in _SELF_PAIRS]
 
     def enter(self, scene: Scene) -> int:
         """Put a scene's boxes and table around the robot; returns the table's body."""
@@ -176,7 +176,7 @@ class _Arena:
         )
         return state[4], state[5]
 
-    def bounds(self, body: int, link: int = -1) -> tuple[Sequence[float], Sequence[float]]:
+    def bounds(self, body: int, link: int = -1) -> _Bounds:
         return pybullet.getAABB(body, link, physicsClientId=self.client)
 
     def distance(self, a: int, b: int, link_a: int = -1, link_b: int = -1) -> float:
@@ -205,7 +205,7 @@ class _Run:
         self.names = tuple(self.boxes)
         self.body = dict(zip(self.boxes, arena.bodies[:-1], strict=True))
         self.table_half = np.array(scene.table.size) / 2
-        self.bounds: dict[str, np.ndarray] = {}
+        self.bounds: dict[str, _Bounds] = {}
         self.poses: dict[str, tuple[Sequence[float], Sequence[float]]] = {}
         for box in scene.objects:
             half = box.yaw / 2
@@ -373,8 +373,7 @@ class _Run:
     def _put(self, name: str, position: Sequence[float], orientation: Sequence[float]) -> None:
         self.poses[name] = (position, orientation)
         self.arena.place(self.body[name], position, orientation)
-        low, high = self.arena.bounds(self.body[name])
-        self.bounds[name] = np.array([low, high])
+        self.bounds[name] = self.arena.bounds(self.body[name])
 
     def _pose(self, q: np.ndarray, opening: float) -> None:
         self.arena.pose_robot(q, opening)
@@ -383,37 +382,37 @@ class _Run:
             self._put(self.held, *pose)
 
     def _overlaps(self, gripped: str | None) -> None:
-        """Record the deepest overlap in the present pose; `gripped` may touch the fingers."""
-        arena, names = self.arena, self.names
-        count = len(arena.solid)
-        bounds = np.array(
-            [arena.bounds(arena.robot, link) for link in arena.solid]
-            + [self.bounds[name] for name in names]
-        )
-        near = _touching(bounds[:count], bounds)
-        for i, j in np.argwhere(near[:, count:]):
-            link, name = arena.solid[i], names[j]
-            if name != gripped or link not in _FINGERS:
-                depth = -arena.distance(arena.robot, self.body[name], link)
-                self._record(depth, arena.names[link], name)
-        for i, j in np.argwhere(near[:, :count] & arena.may_meet):
-            a, b = arena.solid[i], arena.solid[j]
-            depth = -arena.distance(arena.robot, arena.robot, a, b)
-            self._record(depth, arena.names[a], arena.names[b])
-        for i in np.flatnonzero(bounds[:count, 0, 2] < 0):
-            if arena.solid[i] not in (_BASE, 0):
-                depth = -arena.distance(arena.robot, self.table, arena.solid[i])
-                self._record(depth, arena.names[arena.solid[i]], "table")
-        if self.held is None:
+        """Record the deepest overlap in the present pose; `gripped` may touch the fingers.
+
+        Plain loops over tuples: with so few bounds, arrays cost three times as much.
+        """
+        arena, bounds, held = self.arena, self.bounds, self.held
+        above = () if held is None else (held,)
+        links = {link: arena.bounds(arena.robot, link) for link in arena.solid}
+        tallest = max((bounds[name][1][2] for name in self.names if name != held), default=0.0)
+        for link, its in links.items():
+            for name in self.names if its[0][2] <= tallest else above:
+                if _touch(its, bounds[name]) and (name != gripped or link not in _FINGERS):
+                    depth = -arena.distance(arena.robot, self.body[name], link)
+                    self._record(depth, arena.names[link], name)
+        for a, b in arena.may_meet:
+            if _touch(links[a], links[b]):
+                depth = -arena.distance(arena.robot, arena.robot, a, b)
+                self._record(depth, arena.names[a], arena.names[b])
+        for link, (low, _) in links.items():
+            if low[2] < 0 and link not in (_BASE, 0):
+                depth = -arena.distance(arena.robot, self.table, link)
+                self._record(depth, arena.names[link], "table")
+        if held is None:
             return
-        mine = self.bounds[self.held]
-        for j in np.flatnonzero(_touching(mine[None], bounds[count:])[0]):
-            if names[j] != self.held:
-                depth = -arena.distance(self.body[self.held], self.body[names[j]])
-                self._record(depth, self.held, names[j])
-        if mine[0, 2] < 0:
-            depth = -arena.distance(self.body[self.held], self.table)
-            self._record(depth, self.held, "table")
+        mine = bounds[held]
+        for name in self.names:
+            if name != held and _touch(mine, bounds[name]):
+                depth = -arena.distance(self.body[held], self.body[name])
+                self._record(depth, held, name)
+        if mine[0][2] < 0:
+            depth = -arena.distance(self.body[held], self.table)
+            self._record(depth, held, "table")
 
     def _record(self, depth: float, a: str, b: str) -> None:
         self.deepest = max(self.deepest, depth)
@@ -421,8 +420,8 @@ class _Run:
             self.culprit = f"{self.where}: {a} penetrates {b} by {1000 * depth:.1f} mm"
 
 
-def _touching(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Which axis-aligned bounds (A, 2, 3) and (B, 2, 3) overlap: (A, B) bool."""
-    below = a[:, None, 0] <= b[None, :, 1]
-    above = b[None, :, 0] <= a[:, None, 1]
-    return np.all(below & above, axis=-1)
+def _touch(a: _Bounds, b: _Bounds) -> bool:
+    """Whether two axis-aligned bounds overlap; heights first, which settle most pairs."""
+    (ax, ay, az), (AX, AY, AZ) = a
+    (bx, by, bz), (BX, BY, BZ) = b
+    return az <= BZ and bz <= AZ and ax <= BX and bx <= AX and ay <= BY and by <= AY
