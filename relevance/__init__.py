@@ -8,8 +8,10 @@
 Names are imported when first used, so that `import relevance` stays light.
 """
 
+import hashlib
 import os
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -21,6 +23,21 @@ if TYPE_CHECKING:
 # torch's threads spin while they wait unless told so before torch loads; on a shared machine
 # that made a training step four to nine times slower.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
+def _kernel_cache(package: Path) -> Path:
+    """Where compiled kernels are kept: one folder for each content of all their sources.
+
+    Left alone, numba looks for changes in a kernel's own file, not in those of the kernels that
+    it calls, and would go on with what was compiled of the old ones.
+    """
+    sources = (file.read_bytes() for file in sorted(package.rglob("*.py")))
+    digest = hashlib.sha256(b"".join(text for text in sources if b"@njit" in text)).hexdigest()
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return cache / "relevance" / f"kernels-{digest[:16]}"
+
+
+os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_cache(Path(__file__).parent)))
 
 _HOMES = {
     "Dataset": "relevance.store",

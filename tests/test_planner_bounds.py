@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from relevance import _kernel_cache
 from relevance.planner import keyframes, path, placement
 from relevance.planner.kernels import native
 from relevance.planner.kernels.boxes import (
@@ -352,3 +353,15 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
             assert (np.abs(local) <= [0.05, 0.03]).all()
     assert refused > 3
     assert found > 3
+
+
+def test_compiled_kernels_are_kept_by_the_content_of_all_their_sources(tmp_path):
+    (tmp_path / "inner").mkdir()
+    for name in ("a.py", "inner/b.py"):
+        (tmp_path / name).write_text("@njit\ndef f(x): return x\n")
+    (tmp_path / "plain.py").write_text("def f(x): return x\n")
+    before = _kernel_cache(tmp_path)
+    (tmp_path / "plain.py").write_text("def f(x): return 2 * x\n")
+    assert _kernel_cache(tmp_path) == before
+    (tmp_path / "inner/b.py").write_text("@njit\ndef f(x): return 2 * x\n")
+    assert _kernel_cache(tmp_path) != before

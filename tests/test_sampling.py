@@ -21,12 +21,19 @@ from relevance.sampling import (
     Randomisation,
     SceneConfig,
     camera_up,
+    corners,
+    crossing,
+    extents,
     lab,
+    pinhole,
     project,
+    projected,
+    rows,
     sample_goals,
     sample_scene,
     vertices,
 )
+from relevance.sampling.rows import covers, gap
 from relevance.scene import (
     Box,
     Camera,
@@ -492,3 +499,34 @@ def test_vertices_are_the_corners_at_both_heights(x, y, yaw):
     assert np.linalg.norm(points - (x, y, 0.05), axis=1) == pytest.approx(
         np.full(8, math.sqrt(0.05**2 + 0.07**2 + 0.1**2) / 2)
     )
+
+
+# ---------------------------------------------------------------- boxes as rows
+
+
+def some_box(x: float, y: float, yaw: float) -> Box:
+    return Box(name="a", size=(0.05, 0.11, 0.08), position=(x, y, 0.04), yaw=yaw, color=(1, 0, 0))
+
+
+@given(x=st.floats(-0.2, 0.2), y=st.floats(-0.2, 0.2), yaw=st.floats(-3, 3), other=st.floats(-3, 3))
+@settings(deadline=None)
+def test_rows_agree_with_boxes(x, y, yaw, other):
+    a, b = some_box(0.02, 0.01, other), some_box(x, y, yaw)
+    one, two = rows((a, b))
+    assert corners(two) == pytest.approx(vertices(b))
+    assert extents(two) == pytest.approx(b.extents)
+    assert gap(one, two) == pytest.approx(footprint_gap(a, b))
+    camera = Camera()
+    seen = projected(corners(two), *pinhole(camera))
+    pixels, depth = project(camera, vertices(b))
+    assert seen[:, :2] + (camera.width / 2, camera.height / 2) == pytest.approx(pixels)
+    assert seen[:, 2] == pytest.approx(depth)
+    # A ray through the middle comes and goes at points of the surface, and only there.
+    start, middle = np.array([-0.5, 0.1, 0.4]), np.array(b.position)
+    enter, leave = crossing(two, *start, *(middle - start))
+    assert enter + leave == pytest.approx(2)
+    for share, inside in ((enter - 1e-6, False), (enter + 1e-6, True), (leave + 1e-6, False)):
+        at = start + share * (middle - start)
+        within = abs(at[2] - middle[2]) <= b.size[2] / 2
+        assert (covers(two, *at[:2]) and within) == inside
+        assert covers(two, *at[:2]) == b.covers(*at[:2])

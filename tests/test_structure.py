@@ -34,7 +34,7 @@ ANYTHING = ("relevance", "cli")
 DOORS = {
     "pybullet": ("simulation",),
     "casadi": ("planner",),
-    "numba": ("planner",),
+    "numba": ("sampling", "simulation", "planner"),
     "pyarrow": ("store",),
     "duckdb": ("store",),
     "webdataset": ("store",),

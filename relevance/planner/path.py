@@ -326,7 +326,7 @@ def close_pairs(arm, q0, q1, bodies, obstacles, pairs):
 
 
 @njit(cache=True)
-def motion(X, arm, leave, leaving, arrive, bodies, obstacles):
+def motion(X, arm, leave, leaving, arrive, bodies, obstacles) -> tuple[float, float, float]:
     """Fill the rows X (ROWS + 1, 7) between its first and last.
 
     leave / arrive: hand targets (4,) of the two switches; without `leaving` the motion starts
@@ -439,7 +439,7 @@ def _column(X, arm, q, switch, row, direction, safe, targets):
 
 
 @njit(cache=True)
-def retreat(X, arm, leave, bodies, obstacles):
+def retreat(X, arm, leave, bodies, obstacles) -> tuple[float, float, float]:
     """Fill the rows X (2 * VERTICAL + 1, 7) after its first: straight up from a release, to rest.
 
     Returns the worst penetration (m; -1 out of reach), the cost (rad^2) and the time between

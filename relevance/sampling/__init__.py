@@ -16,8 +16,9 @@ the queries are relevant, as in the paper. All of it is configuration, hence in 
 from relevance.sampling.colors import lab
 from relevance.sampling.fitting import GRASPABLE_EDGE
 from relevance.sampling.goals import GoalConfig, sample_goals
-from relevance.sampling.projection import camera_up, project, vertices
+from relevance.sampling.projection import camera_up, pinhole, project, vertices
 from relevance.sampling.randomisation import Randomisation
+from relevance.sampling.rows import bound, corners, crossing, extents, projected, row, rows
 from relevance.sampling.scenes import SceneConfig, sample_scene
 
 __all__ = [
@@ -25,9 +26,17 @@ __all__ = [
     "GoalConfig",
     "Randomisation",
     "SceneConfig",
+    "bound",
     "camera_up",
+    "corners",
+    "crossing",
+    "extents",
     "lab",
+    "pinhole",
     "project",
+    "projected",
+    "row",
+    "rows",
     "sample_goals",
     "sample_scene",
     "vertices",

@@ -105,5 +105,5 @@ _TO_XYZ = np.array(  # IEC 61966-2-1
 def from_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
     """RGB (3,) of a hue, saturation and value in 0..1, rounded to 0.001."""
     k = (np.array([5.0, 3.0, 1.0]) + 6 * hue) % 6
-    shade = np.clip(np.minimum(k, 4 - k), 0, 1)
+    shade = np.maximum(np.minimum(np.minimum(k, 4 - k), 1), 0)  # np.clip is slow on so few
     return np.round(value * (1 - saturation * shade), 3)

@@ -9,142 +9,249 @@ face that it can see.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numba import njit
 
-from relevance.sampling.projection import project, vertices
-from relevance.scene import Box, footprint_gap
+from relevance.sampling.projection import pinhole
+from relevance.sampling.rows import (
+    ROW,
+    bound,
+    corners,
+    covers,
+    crossing,
+    extents,
+    gap,
+    projected,
+    row,
+)
+from relevance.scene import GAP, Box
 
 if TYPE_CHECKING:
     from relevance.sampling.scenes import SceneConfig
 
 GRASPABLE_EDGE = 0.07
 """Longest footprint edge that the hand (opening 8 cm) takes with room to spare, m."""
-
-
-class Standing:
-    """The boxes drawn so far, as the arm and the camera meet them."""
-
-    def __init__(self, config: SceneConfig) -> None:
-        self.boxes: list[Box] = []
-        self._config = config
-        self._eye = np.array(config.camera.eye)
-        self._limit = np.array([config.camera.width, config.camera.height]) - config.image_margin
-        # Of each box: its bounds in the image (x and y, low and high, px), the points of its
-        # faces (27, 3), the share of it that each stands for (27,), and which of them are hidden.
-        self._bounds: list[tuple[float, float, float, float]] = []
-        self._points: list[np.ndarray] = []
-        self._shares: list[np.ndarray] = []
-        self._hidden: list[np.ndarray] = []
-
-    def admits(self, box: Box) -> bool:
-        """Whether the box can be reached and seen whole, keeps its distance and hides none."""
-        if not (self._within(box) and self._apart(box)):
-            return False
-        bounds = self._seen(box)
-        return bounds is not None and self._shows(box, bounds)
-
-    def add(self, box: Box) -> None:
-        """Put the box there."""
-        bounds, (points, shares) = self._seen(box), self._faces(box)
-        assert bounds is not None, "only what is admitted is added"
-        hidden = np.zeros(len(points), dtype=bool)
-        for i in self._overlapping(bounds):
-            self._hidden[i] = self._hidden[i] | self._behind(self._points[i], box)
-            hidden |= self._behind(points, self.boxes[i])
-        self.boxes.append(box)
-        self._bounds.append(bounds)
-        self._points.append(points)
-        self._shares.append(shares)
-        self._hidden.append(hidden)
-
-    def _within(self, box: Box) -> bool:
-        config, (x, y, _) = self._config, box.position
-        base = config.robot.base
-        if not config.reach[0] <= math.hypot(x - base[0], y - base[1]) <= config.reach[1]:
-            return False
-        (ex, ey), (along, across) = box.extents, config.table.size
-        margin = config.table_margin
-        return abs(x) + ex <= along / 2 - margin and abs(y) + ey <= across / 2 - margin
-
-    def _apart(self, box: Box) -> bool:
-        spacing, radius = self._config.spacing, math.hypot(*box.size[:2]) / 2
-        for other in self.boxes:
-            if other.name == box.on or box.bottom - other.top >= spacing:
-                continue
-            reach = radius + math.hypot(*other.size[:2]) / 2 + spacing
-            dx, dy = box.position[0] - other.position[0], box.position[1] - other.position[1]
-            # Disks that are apart settle most pairs.
-            if dx * dx + dy * dy < reach * reach and footprint_gap(box, other) < spacing:
-                return False
-        return True
-
-    def _shows(self, box: Box, bounds: tuple[float, float, float, float]) -> bool:
-        """Whether enough of this box and of every other would show."""
-        near = self._overlapping(bounds)
-        if not near:
-            return True
-        least = self._config.visible
-        for i in near:
-            hidden = self._hidden[i] | self._behind(self._points[i], box)
-            if self._shares[i][~hidden].sum() < least:
-                return False
-        points, shares = self._faces(box)
-        hidden = np.zeros(len(points), dtype=bool)
-        for i in near:
-            hidden |= self._behind(points, self.boxes[i])
-        return bool(shares[~hidden].sum() >= least)
-
-    def _seen(self, box: Box) -> tuple[float, float, float, float] | None:
-        """Bounds of the box in the image, px; None when it is not wholly in the picture."""
-        pixels, depth = project(self._config.camera, vertices(box))
-        if depth.min() <= self._config.camera.near:
-            return None
-        (left, upper), (right, lower) = pixels.min(axis=0), pixels.max(axis=0)
-        margin = self._config.image_margin
-        if min(left, upper) < margin or right > self._limit[0] or lower > self._limit[1]:
-            return None
-        return left, right, upper, lower
-
-    def _overlapping(self, bounds: tuple[float, float, float, float]) -> list[int]:
-        left, right, upper, lower = bounds
-        return [
-            i
-            for i, (a, b, c, d) in enumerate(self._bounds)
-            if a < right and left < b and c < lower and upper < d
-        ]
-
-    def _faces(self, box: Box) -> tuple[np.ndarray, np.ndarray]:
-        """Nine points of each of three faces, (27, 3), m, and their shares of what shows, (27,).
-
-        Of two opposite faces it is the one towards the camera; its share is what it takes of
-        the picture of the box alone, which is none when the camera stands between the two.
-        """
-        half, turn = np.array(box.size) / 2, _turn(box)
-        eye = (self._eye - np.array(box.position)) @ turn
-        points = _FACES * np.where(eye >= 0, half, -half)
-        sight = eye - points
-        facing = np.repeat(np.maximum(np.abs(eye) - half, 0.0) / half, 9)
-        shares = facing * (sight * sight).sum(axis=1) ** -1.5
-        return points @ turn.T + np.array(box.position), shares / shares.sum()
-
-    def _behind(self, points: np.ndarray, box: Box) -> np.ndarray:
-        """Which points (K, 3) the box hides from the camera, (K,)."""
-        half, turn = np.array(box.size) / 2, _turn(box)
-        start = (self._eye - np.array(box.position)) @ turn
-        along = (points - self._eye) @ turn
-        along[along == 0] = 1e-12
-        a, b = (-half - start) / along, (half - start) / along
-        enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
-        return (enter < leave) & (enter < 1 - 1e-6) & (leave > 0)
-
-
-def _turn(box: Box) -> np.ndarray:
-    """The axes of a box as columns, (3, 3)."""
-    c, s = math.cos(box.yaw), math.sin(box.yaw)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
+COMMON_RADIUS = 0.0275
+"""Half the shorter footprint edge of a common subject, m."""
 
 _GRID = [(u, v) for u in (-2 / 3, 0.0, 2 / 3) for v in (-2 / 3, 0.0, 2 / 3)]
 _FACES = np.array([np.insert(uv, axis, 1.0) for axis in range(3) for uv in _GRID])
+
+
+class _Limits(NamedTuple):
+    """What a box must keep to, as plain numbers (see SceneConfig)."""
+
+    base_x: float
+    base_y: float
+    nearest: float
+    farthest: float
+    half_x: float
+    half_y: float
+    spacing: float
+    width: float
+    height: float
+    image_margin: float
+    near: float
+    visible: float
+
+
+class _Shown(NamedTuple):
+    """The boxes drawn so far, up to N: rows to fill in, of which the first few are in use."""
+
+    boxes: np.ndarray
+    """(N, ROW)."""
+    bounds: np.ndarray
+    """(N, 4): in the image, lowest x and y, then highest, px from its middle."""
+    points: np.ndarray
+    """(N, 27, 3): nine of each of the three faces towards the camera, m."""
+    shares: np.ndarray
+    """(N, 27): the share of what shows of the box that each point stands for."""
+    hidden: np.ndarray
+    """(N, 27): which of them other boxes hide."""
+
+
+class Standing:
+    """The boxes drawn so far, as the arm and the camera meet them; candidates come as rows."""
+
+    def __init__(self, config: SceneConfig) -> None:
+        self.boxes: list[Box] = []
+        margin, (x, y), camera = config.table_margin, config.table.size, config.camera
+        limits = (
+            *config.robot.base[:2],
+            *config.reach,
+            x / 2 - margin,
+            y / 2 - margin,
+            config.spacing,
+            camera.width,
+            camera.height,
+            config.image_margin,
+            camera.near,
+            config.visible,
+        )
+        self._limits = _Limits(*map(float, limits))  # one type of number: compiled once
+        self._eye, self._axes, self._focal = pinhole(camera)
+        most = config.max_objects + 1
+        self._shown = _Shown(
+            np.empty((most, ROW)),
+            np.empty((most, 4)),
+            np.empty((most, 27, 3)),
+            np.empty((most, 27)),
+            np.zeros((most, 27), dtype=np.bool_),
+        )
+
+    def admits(self, candidate: np.ndarray, carrier: int = -1) -> bool:
+        """Whether the box can be reached and seen whole, keeps its distance and hides none.
+
+        carrier: index of the box that it stands on, if any.
+        """
+        count, view = len(self.boxes), (self._eye, self._axes, self._focal)
+        return _fits(candidate, carrier, count, self._shown, self._limits, *view)
+
+    def closes(self, candidate: np.ndarray) -> int:
+        """How many goal regions a new box closes: those it stands in, and its own."""
+        return _closed(candidate, len(self.boxes), self._shown.boxes)
+
+    def add(self, box: Box) -> None:
+        """Put the box there; it must have been admitted."""
+        count, view = len(self.boxes), (self._eye, self._axes, self._focal)
+        self._shown.boxes[count] = row(box.size, box.position, box.yaw)
+        _place(count, self._shown, self._limits, *view)
+        self.boxes.append(box)
+
+
+@njit(cache=True)
+def _fits(box, carrier, count, shown, limits, eye, axes, focal):
+    """`Standing.admits` for a box (ROW,) among the first few that are shown."""
+    distance = math.hypot(box[0] - limits.base_x, box[1] - limits.base_y)
+    if not limits.nearest <= distance <= limits.farthest:
+        return False
+    ex, ey = extents(box)
+    if abs(box[0]) + ex > limits.half_x or abs(box[1]) + ey > limits.half_y:
+        return False
+    for j in range(count):
+        other = shown.boxes[j]
+        above = (box[2] - box[5]) - (other[2] + other[5]) >= limits.spacing
+        if j != carrier and not above and gap(box, other) < limits.spacing:
+            return False
+    bounds = np.empty(4)
+    return _seen(box, limits, eye, axes, focal, bounds) and _shows(
+        box, bounds, count, shown, limits.visible, eye
+    )
+
+
+@njit(cache=True)
+def _seen(box, limits, eye, axes, focal, bounds):
+    """Whether the box is wholly in the picture; fills its bounds there (4,), px."""
+    points = projected(corners(box), eye, axes, focal)
+    for k in range(8):
+        if points[k, 2] <= limits.near:
+            return False
+    bound(points, bounds)
+    x, y = limits.width / 2 - limits.image_margin, limits.height / 2 - limits.image_margin
+    return bounds[0] >= -x and bounds[1] >= -y and bounds[2] <= x and bounds[3] <= y
+
+
+@njit(cache=True)
+def _shows(box, bounds, count, shown, least, eye):
+    """Whether enough of this box and of every other would show."""
+    points, shares, alone = np.empty((27, 3)), np.empty(27), True
+    for j in range(count):
+        if not _overlap(bounds, shown.bounds[j]):
+            continue
+        alone, seen = False, 0.0
+        for k in range(27):
+            if not shown.hidden[j, k] and not _behind(shown.points[j, k], box, eye):
+                seen += shown.shares[j, k]
+        if seen < least:
+            return False
+    if alone:
+        return True
+    _faces(box, eye, points, shares)
+    seen = 0.0
+    for k in range(27):
+        hidden = False
+        for j in range(count):
+            if not hidden and _overlap(bounds, shown.bounds[j]):
+                hidden = _behind(points[k], shown.boxes[j], eye)
+        if not hidden:
+            seen += shares[k]
+    return seen >= least
+
+
+@njit(cache=True)
+def _place(i, shown, limits, eye, axes, focal):
+    """Fill in what is shown of box i, and what it hides of those before it."""
+    box, bounds = shown.boxes[i], shown.bounds[i]
+    admitted = _seen(box, limits, eye, axes, focal, bounds)
+    assert admitted, "only what is admitted is added"
+    _faces(box, eye, shown.points[i], shown.shares[i])
+    for j in range(i):
+        if _overlap(bounds, shown.bounds[j]):
+            for k in range(27):
+                shown.hidden[j, k] |= _behind(shown.points[j, k], box, eye)
+                shown.hidden[i, k] |= _behind(shown.points[i, k], shown.boxes[j], eye)
+
+
+@njit(cache=True)
+def _overlap(a, b):
+    """Whether two bounds in the image (4,) overlap."""
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+@njit(cache=True)
+def _faces(box, eye, points, shares):
+    """Fill nine points of each of three faces, (27, 3), m, and their shares of what shows, (27,).
+
+    Of two opposite faces it is the one towards the camera; its share is what it takes of
+    the picture of the box alone, which is none when the camera stands between the two.
+    """
+    c, s = box[6], box[7]
+    dx, dy = eye[0] - box[0], eye[1] - box[1]
+    local = (c * dx + s * dy, c * dy - s * dx, eye[2] - box[2])
+    total = 0.0
+    for k in range(27):
+        half = box[3 + k // 9]
+        facing = max(abs(local[k // 9]) - half, 0.0) / half
+        x = _FACES[k, 0] * math.copysign(box[3], local[0])
+        y = _FACES[k, 1] * math.copysign(box[4], local[1])
+        z = _FACES[k, 2] * math.copysign(box[5], local[2])
+        sight = (local[0] - x) ** 2 + (local[1] - y) ** 2 + (local[2] - z) ** 2
+        shares[k] = facing * sight**-1.5
+        total += shares[k]
+        points[k, 0], points[k, 1] = box[0] + c * x - s * y, box[1] + s * x + c * y
+        points[k, 2] = box[2] + z
+    for k in range(27):
+        shares[k] /= total
+
+
+@njit(cache=True)
+def _behind(point, box, eye):
+    """Whether the box hides a point (3,) from the camera."""
+    dx, dy, dz = point[0] - eye[0], point[1] - eye[1], point[2] - eye[2]
+    enter, leave = crossing(box, eye[0], eye[1], eye[2], dx, dy, dz)
+    return enter < leave and enter < 1 - 1e-6 and leave > 0
+
+
+@njit(cache=True)
+def _closed(box, count, boxes):
+    """`Standing.closes` for a box (ROW,) among the first few of boxes (N, ROW)."""
+    closed = 0
+    for quarter in range(4):
+        x, y = _way_in(box, quarter)
+        own = False
+        for j in range(count):
+            own |= covers(boxes[j], x, y)
+            other_x, other_y = _way_in(boxes[j], quarter)
+            closed += covers(box, other_x, other_y)
+        closed += own
+    return closed
+
+
+@njit(cache=True)
+def _way_in(box, quarter):
+    """The middle of one of a box's four goal regions, for a subject of common width."""
+    ex, ey = extents(box)
+    away = (1 - quarter // 2 * 2) * ((ex if quarter % 2 == 0 else ey) + COMMON_RADIUS + GAP / 2)
+    return (box[0] + away, box[1]) if quarter % 2 == 0 else (box[0], box[1] + away)

@@ -15,9 +15,9 @@ from relevance.scene import Goal, Predicate, Scene, goal_holds
 class GoalConfig:
     """The odds of goals; they look at who carries whom, never at plans."""
 
-    carrying_reference: float = 0.95
+    carrying_reference: float = 0.98
     """Share of `on` goals whose reference carries a box already, where the scene has one."""
-    carrying_subject: float = 4.0
+    carrying_subject: float = 30.0
     """How likely a box that carries another is drawn as subject, relative to one that does not."""
 
     def __post_init__(self) -> None:

@@ -15,7 +15,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
     Pixel (0, 0) is the outer corner of the top-left pixel; depth is along the optical axis.
     """
-    eye, axes, focal = _pinhole(camera)
+    eye, axes, focal = pinhole(camera)
     relative = (points - eye) @ axes
     depth = relative[..., 2]
     pixels = relative[..., :2] / depth[..., None] * focal
@@ -29,7 +29,7 @@ def camera_up(camera: Camera) -> tuple[float, float, float]:
 
 
 @lru_cache(maxsize=16)
-def _pinhole(camera: Camera) -> tuple[np.ndarray, np.ndarray, float]:
+def pinhole(camera: Camera) -> tuple[np.ndarray, np.ndarray, float]:
     """Eye (3,), image axes right, down and forward as columns (3, 3), focal length in pixels."""
     eye, target = np.array(camera.eye), np.array(camera.target)
     forward = (target - eye) / np.linalg.norm(target - eye)

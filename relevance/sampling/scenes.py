@@ -16,6 +16,7 @@ from relevance.sampling.randomisation import (
     draw_light,
     draw_table,
 )
+from relevance.sampling.rows import row
 from relevance.scene import (
     FAMILIES,
     GAP,
@@ -35,8 +36,6 @@ CENTRED = 0.2
 """How far off a neighbour's middle a crowded box may stand, as a share of its half extent."""
 BROADSIDE = 0.15
 """How far a crowded box may be turned out of line with its neighbour's sides, rad."""
-COMMON_RADIUS = 0.0275
-"""Half the shorter footprint edge of a common subject, m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -198,9 +197,11 @@ def sample_scene(
     )
 
 
-def _size(rng: np.random.Generator, config: SceneConfig) -> tuple[float, float, float]:
+def _size(
+    rng: np.random.Generator, config: SceneConfig, obstacles: float, tallest: float
+) -> tuple[float, float, float]:
     """Edges of a box: one footprint edge fits the hand, unless it is drawn as an obstacle."""
-    obstacle = rng.random() < config.obstacle_share
+    obstacle = rng.random() < obstacles
     if obstacle:
         low = min(GRASPABLE_EDGE + 0.015, config.max_edge)
         a, b = rng.uniform(low, config.max_edge, 2)
@@ -209,7 +210,7 @@ def _size(rng: np.random.Generator, config: SceneConfig) -> tuple[float, float, 
         b = rng.uniform(config.min_edge, config.max_edge)
     if rng.random() < 0.5:
         a, b = b, a
-    height = rng.uniform(config.min_edge, config.max_height)
+    height = rng.uniform(config.min_edge, tallest)
     # Floored to 0.1 mm, so that a limit stays kept and files stay readable.
     x, y, z = (math.floor(edge * 1e4 + 1e-6) / 1e4 for edge in (a, b, height))
     return x, y, z
@@ -222,49 +223,43 @@ def _table_box(
     standing: Standing,
     config: SceneConfig,
 ) -> Box | None:
-    boxes, size = standing.boxes, _size(rng, config)
+    boxes, size = standing.boxes, _size(rng, config, config.obstacle_share, config.max_height)
     crowding = config.crowding_on if config.family == "on" else config.crowding
     crowd = bool(boxes) and rng.random() < crowding
-    fitting: list[Box] = []
+    best, most, fitting = None, -1, 0
     for _ in range(config.tries):
         if crowd:
             x, y, yaw = _beside(rng, size, boxes[int(rng.integers(len(boxes)))], config)
         else:
             x, y, yaw = _anywhere(rng, config)
-        box = Box(
-            name=name,
-            size=size,
-            position=(round(x, 4), round(y, 4), size[2] / 2),
-            yaw=round(yaw, 4),
-            color=color,
-        )
-        if standing.admits(box):
-            fitting.append(box)
-            if not crowd or len(fitting) == config.choices:
+        position, yaw = (round(x, 4), round(y, 4), size[2] / 2), round(yaw, 4)
+        candidate = np.array(row(size, position, yaw))
+        if standing.admits(candidate):
+            closed = standing.closes(candidate)
+            if closed > most:
+                best, most = (position, yaw), closed
+            fitting += 1
+            if not crowd or fitting == config.choices:
                 break
-    return max(fitting, key=lambda box: _closed(box, boxes), default=None)
-
-
-def _closed(box: Box, boxes: list[Box]) -> int:
-    """How many goal regions a new box closes: those it stands in, and its own."""
-    closing = sum(box.covers(x, y) for other in boxes for x, y in _ways_in(other))
-    return closing + sum(any(b.covers(x, y) for b in boxes) for x, y in _ways_in(box))
-
-
-def _ways_in(box: Box) -> list[tuple[float, float]]:
-    """The middles of its four goal regions, for a subject of common width."""
-    (x, y, _), (ex, ey), r = box.position, box.extents, COMMON_RADIUS + GAP / 2
-    return [(x + ex + r, y), (x - ex - r, y), (x, y + ey + r), (x, y - ey - r)]
+    if best is None:
+        return None
+    return Box(name=name, size=size, position=best[0], yaw=best[1], color=color)
 
 
 def _anywhere(rng: np.random.Generator, config: SceneConfig) -> tuple[float, float, float]:
     """A pose that is uniform over the table's part in front of the robot."""
     half_x, half_y = config.table.size[0] / 2, config.table.size[1] / 2
+    a, b, turn = rng.random(3).tolist()
     return (
-        float(rng.uniform(-half_x, half_x)),
-        float(rng.uniform(-half_y, half_y)),
-        float(rng.uniform(-math.pi / 2, math.pi / 2)),
+        _within(-half_x, half_x, a),
+        _within(-half_y, half_y, b),
+        _within(-math.pi / 2, math.pi / 2, turn),
     )
+
+
+def _within(low: float, high: float, share: float) -> float:
+    """A draw from 0..1 stretched over a range as `Generator.uniform` does, in less time."""
+    return low + (high - low) * share
 
 
 def _beside(
@@ -281,12 +276,14 @@ def _beside(
     quarter = int(rng.integers(4))
     axis = quarter % 2
     broadside = 0.0 if (size[0] < size[1]) == (axis == 0) else math.pi / 2
-    yaw = broadside + float(rng.uniform(-BROADSIDE, BROADSIDE))
+    turn, deep, off = rng.random(3).tolist()
+    yaw = broadside + _within(-BROADSIDE, BROADSIDE, turn)
     c, s = abs(math.cos(yaw)), abs(math.sin(yaw))
     extents = (c * size[0] + s * size[1]) / 2, (s * size[0] + c * size[1]) / 2
-    gap = max(config.spacing, float(rng.uniform(NEAR, GAP)))
-    along = neighbour.extents[axis] + extents[axis] + gap
-    across = float(rng.uniform(-CENTRED, CENTRED)) * neighbour.extents[1 - axis]
+    gap = max(config.spacing, _within(NEAR, GAP, deep))
+    there = neighbour.extents
+    along = there[axis] + extents[axis] + gap
+    across = _within(-CENTRED, CENTRED, off) * there[1 - axis]
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
     x = neighbour.position[0] + along * c - across * s
     y = neighbour.position[1] + along * s + across * c
@@ -303,31 +300,28 @@ def _stacked_box(
     """A box on one that carries none yet, its centre over the middle half of the top face."""
     taken = {box.on for box in standing.boxes}
     free = [
-        box
-        for box in standing.boxes
+        i
+        for i, box in enumerate(standing.boxes)
         if box.on is None
         and box.name not in taken
         and box.top + config.min_edge < config.stack_height
     ]
     for _ in range(min(config.tries, 4 * len(free))):
-        carrier = free[int(rng.integers(len(free)))]
+        i = free[int(rng.integers(len(free)))]
+        carrier = standing.boxes[i]
         tallest = min(config.stack_height - carrier.top, config.max_height)
-        size = _size(rng, replace(config, obstacle_share=0.0, max_height=tallest))
+        size = _size(rng, config, 0.0, tallest)
         yaw = float(rng.uniform(-math.pi / 2, math.pi / 2))
         c, s = math.cos(carrier.yaw), math.sin(carrier.yaw)
         dx, dy = rng.uniform(-0.25, 0.25, 2) * carrier.size[:2]
-        box = Box(
-            name=name,
-            size=size,
-            position=(
-                round(carrier.position[0] + float(c * dx - s * dy), 4),
-                round(carrier.position[1] + float(s * dx + c * dy), 4),
-                carrier.top + size[2] / 2,
-            ),
-            yaw=round(yaw, 4),
-            color=color,
-            on=carrier.name,
+        position = (
+            round(carrier.position[0] + float(c * dx - s * dy), 4),
+            round(carrier.position[1] + float(s * dx + c * dy), 4),
+            carrier.top + size[2] / 2,
         )
-        if standing.admits(box):
-            return box
+        yaw = round(yaw, 4)
+        if standing.admits(np.array(row(size, position, yaw)), i):
+            return Box(
+                name=name, size=size, position=position, yaw=yaw, color=color, on=carrier.name
+            )
     return None

@@ -1,13 +1,14 @@
 """Pictures of scenes: image, mask, canonical views and how much of each object shows.
 
-Boxes are drawn by pybullet's TinyRenderer (no GPU, no display). The table is a plane under one
-light, so its pixels (and the pattern on it, if any) are filled in closed form, in a third of the
-time; the mask stays that of a full render. Shadows are closed form too, on the table and on the
-boxes: TinyRenderer's shadow map speckles faces that the light grazes. So is the number of pixels
-that a box would show alone (a convex silhouette); nothing is rendered twice. Light arguments
-persist in pybullet from one call to the next, so every call passes all of them; each scene
-starts from `resetSimulation`, which leaks least. The arm is left out: its meshes cost more
-than the rest of the picture.
+Boxes are drawn by pybullet's TinyRenderer (no GPU, no display), in the part of the picture that
+holds them: it takes as long for an empty pixel. The table is a plane under one light, so its
+pixels (and the pattern on it, if any) are filled in closed form, far faster; the mask stays that
+of a full render. Shadows are closed form too, on the table and on the boxes: TinyRenderer's
+shadow map speckles faces that the light grazes. So is the number of pixels that a box would show
+alone (a convex silhouette); nothing is rendered twice. The loops over pixels are compiled
+(`shadows`). Light arguments persist in pybullet from one call to the next, so every call passes
+all of them; each scene starts from `resetSimulation`, which leaks least. The arm is left out: its
+meshes cost more than the rest of the picture.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from types import TracebackType
 
 import numpy as np
 
-from relevance.sampling import camera_up, project, vertices
+from relevance.sampling import camera_up, pinhole, row, rows
 from relevance.scene import Box, Camera, Color, Light, Scene, Table
 from relevance.simulation.bullet import pybullet
+from relevance.simulation.shadows import SHADOWED, ground, halved, paint, silhouettes
 from relevance.simulation.textures import pattern
 
 VIEW_PIXELS = 32
@@ -34,23 +36,8 @@ MIN_VISIBLE_PIXELS = 60
 """A scene is rejected when an object shows fewer pixels than this."""
 
 
-def _pack(color: Sequence[float] | np.ndarray) -> np.uint32:
-    """A colour in 0..255 as one word, in the byte order of pybullet's RGBA pixels.
-
-    Moving a word a pixel makes the fills below eight times faster than three bytes.
-    """
-    red, green, blue = (int(min(max(value, 0), 255)) for value in color)
-    return np.array([red, green, blue, 255], dtype=np.uint8).view(np.uint32)[0]
-
-
-def _unpack(words: np.ndarray) -> np.ndarray:
-    """RGB (H, W, 3) uint8 of packed pixels (H, W)."""
-    return np.ascontiguousarray(words.view(np.uint8).reshape(*words.shape, 4)[..., :3])
-
-
-_FLOOR = _pack((176, 180, 188))
-_VIEW_BACKGROUND = _pack((128, 128, 128))
-_SHADOWED = 0.8  # the share of direct light that TinyRenderer leaves in a shadow
+_FLOOR = (176, 180, 188)
+_VIEW_BACKGROUND = (128, 128, 128)
 # Canonical view: from the robot's side, 45 degrees down like the scene camera, turned so that
 # three faces show; 13 degrees at 1 m hold every box of up to 12 cm.
 _VIEW_CAMERA = Camera(
@@ -94,7 +81,7 @@ class Renderer:
         if self._client < 0:
             raise RuntimeError("pybullet gave no client: too many are open in this process")
         self._views: OrderedDict[tuple, np.ndarray] = OrderedDict()
-        self._table_colors: OrderedDict[tuple, tuple[np.uint32, np.uint32]] = OrderedDict()
+        self._table_colors: OrderedDict[tuple, np.ndarray] = OrderedDict()
 
     def __enter__(self) -> Renderer:
         return self
@@ -115,30 +102,31 @@ class Renderer:
 
     def render(self, scene: Scene) -> Rendering:
         """Scene image, mask, canonical views and visibility of every object."""
-        shades = self._table_shades(scene.table.color, scene.light)
-        if scene.table.texture is not None:
-            second = self._table_shades(scene.table.texture.color, scene.light)
-            shades = _textured(scene, shades, second)
+        camera, light = scene.camera, scene.light
+        shades = self._shades(scene)
         pybullet.resetSimulation(physicsClientId=self._client)
-        bodies, views = [], []
+        views = []
         for box in scene.objects:
             body = self._create(box)
-            views.append(self._view(body, box, scene.light))
+            assert body == len(views), "ids count up from 0 after a reset"
+            views.append(self._view(body, box, light))
             self._put(body, _PARKED, 0.0)
-            bodies.append(body)
-        for body, box in zip(bodies, scene.objects, strict=True):
+        for body, box in enumerate(scene.objects):
             self._put(body, box.position, box.yaw)
-        words, segments = self._picture(scene.camera, scene.light)
-        # One look-up a pixel; body ids count up from 0, and -1 is nothing.
-        values = np.zeros(max(bodies) + 2, dtype=np.uint8)
-        values[np.array(bodies) + 1] = np.arange(1, len(bodies) + 1)
-        mask = values[segments + 1]
-        _fill_ground(words, mask == 0, scene, *shades)
-        image = _unpack(words)
-        if scene.light.shadow:
-            _shade_boxes(image, mask, scene)
-        visible = np.bincount(mask.ravel(), minlength=len(bodies) + 1)[1:]
-        alone = np.array([self._pixels_alone(i, bodies, scene) for i in range(len(bodies))])
+        boxes = rows(scene.objects)
+        alone, part = _silhouettes(boxes, camera)
+        image, mask, visible = paint(
+            *self._picture(camera, light, part),
+            boxes,
+            255 * light.ambient * np.array([box.color for box in scene.objects]),
+            _ground(camera, scene.table),
+            *pinhole(camera),
+            _source(light) if light.shadow else np.empty(0),
+            shades,
+            _FLOOR,
+        )
+        for i in np.flatnonzero(alone < 0):
+            alone[i] = self._pixels_alone(int(i), scene)
         return Rendering(
             image=image,
             mask=mask,
@@ -168,17 +156,36 @@ class Renderer:
             physicsClientId=self._client,
         )
 
-    def _picture(self, camera: Camera, light: Light) -> tuple[np.ndarray, np.ndarray]:
-        """Packed pixels (H, W) uint32 and body ids (H, W), -1 for nothing."""
-        aspect = camera.width / camera.height
+    def _picture(
+        self, camera: Camera, light: Light, part: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """RGBA pixels (H, W, 4) uint8 and body ids (H, W) int32, -1 for nothing.
+
+        part (4,): of `silhouettes`; no box is outside it, and the colours there mean nothing. A
+        pixel costs the same with or without a box on it.
+        """
+        width, height = camera.width, camera.height
+        left, upper, right, lower = (0, 0, width, height) if part is None else part.tolist()
+        if left >= right:  # no box is in the picture
+            left, upper, right, lower = 0, 0, 1, 1
+        wide, high = right - left, lower - upper
+        aspect = width / height
         vertical = 2 * math.atan(math.tan(math.radians(camera.fov) / 2) / aspect)
-        _, _, rgba, _, segments = pybullet.getCameraImage(
-            camera.width,
-            camera.height,
-            pybullet.computeViewMatrix(camera.eye, camera.target, camera_up(camera)),
+        # The frustum of the whole picture (column by column), cut down to the part.
+        frustum = list(
             pybullet.computeProjectionMatrixFOV(
                 math.degrees(vertical), aspect, camera.near, camera.far
-            ),
+            )
+        )
+        frustum[0] *= width / wide
+        frustum[5] *= height / high
+        frustum[8] = (left + right - width) / wide
+        frustum[9] = (height - upper - lower) / high
+        _, _, rgba, _, bodies = pybullet.getCameraImage(
+            wide,
+            high,
+            pybullet.computeViewMatrix(camera.eye, camera.target, camera_up(camera)),
+            frustum,
             lightDirection=light.direction,
             lightColor=light.color,
             lightDistance=light.distance,
@@ -189,9 +196,12 @@ class Renderer:
             renderer=pybullet.ER_TINY_RENDERER,
             physicsClientId=self._client,
         )
-        shape = (camera.height, camera.width)
-        words = np.asarray(rgba, dtype=np.uint8).reshape(-1).view(np.uint32)
-        return words.reshape(shape), np.reshape(np.asarray(segments), shape)
+        window = np.s_[upper:lower, left:right]
+        whole = np.zeros((height, width, 4), dtype=np.uint8)
+        whole[window] = np.asarray(rgba, dtype=np.uint8).reshape(high, wide, 4)
+        ids = np.full((height, width), -1, dtype=np.int32)
+        ids[window] = np.reshape(np.asarray(bodies), (high, wide))
+        return whole, ids
 
     def _view(self, body: int, box: Box, light: Light) -> np.ndarray:
         """Canonical view of a box, alone in front of the camera, (32, 32, 3) uint8."""
@@ -200,17 +210,35 @@ class Renderer:
             self._views.move_to_end(key)
             return self._views[key]
         self._put(body, (0.0, 0.0, 0.0), _VIEW_YAW)
-        words, segments = self._picture(_VIEW_CAMERA, light)
-        words[segments != body] = _VIEW_BACKGROUND
-        blocks = _unpack(words).reshape(VIEW_PIXELS, 2, VIEW_PIXELS, 2, 3).astype(np.uint16)
-        view = ((blocks.sum(axis=(1, 3)) + 2) // 4).astype(np.uint8)
+        posed = np.array([row(box.size, (0.0, 0.0, 0.0), _VIEW_YAW)])
+        pixels, bodies = self._picture(_VIEW_CAMERA, light, _silhouettes(posed, _VIEW_CAMERA)[1])
+        view = halved(pixels, bodies, body, _VIEW_BACKGROUND)
         self._views[key] = view
         if len(self._views) > _CACHED_VIEWS:
             self._views.popitem(last=False)
         return view
 
-    def _table_shades(self, color: Color, light: Light) -> tuple[np.uint32, np.uint32]:
-        """A colour of the table in the light and in a shadow, packed.
+    def _shades(self, scene: Scene) -> np.ndarray:
+        """The table's pixels in the light and in a shadow, (2, H, W, 3) uint8.
+
+        Both colours of a texture come with their shades; the pattern blends those.
+        """
+        table, camera = scene.table, scene.camera
+        plain = self._table_shades(table.color, scene.light)
+        if table.texture is None:
+            whole = (2, camera.height, camera.width, 3)
+            return np.broadcast_to(plain[:, None, None], whole)
+        x, y = _ground(camera, table)
+        on_table = ~np.isnan(x)
+        share = pattern(table.texture, x[on_table], y[on_table])[:, None]
+        first, second = plain.astype(float), self._table_shades(table.texture.color, scene.light)
+        shades = np.zeros((2, *x.shape, 3), dtype=np.uint8)
+        for k in range(2):
+            shades[k, on_table] = np.rint(first[k] + share * (second[k] - first[k]))
+        return shades
+
+    def _table_shades(self, color: Color, light: Light) -> np.ndarray:
+        """A colour of the table in the light and in a shadow, (2, 3) uint8.
 
         The lit one is what TinyRenderer makes of a patch of it; a plane has the same shade all
         over, since light and normal are the same. Changes the simulated world.
@@ -233,29 +261,23 @@ class Renderer:
                 baseMass=0.0, baseVisualShapeIndex=shape, physicsClientId=self._client
             )
             camera = Camera(eye=(-0.5, 0.0, 0.5), width=8, height=8, fov=10.0)
-            lit = _unpack(self._picture(camera, light)[0])[4, 4]
+            lit = self._picture(camera, light)[0][4, 4, :3]
             ambient = 255 * light.ambient * np.array(color)
-            shadowed = ambient + _SHADOWED * np.maximum(lit - ambient, 0)
-            self._table_colors[key] = (_pack(lit), _pack(shadowed))
+            shadowed = ambient + SHADOWED * np.maximum(lit - ambient, 0)
+            self._table_colors[key] = np.array([lit, np.minimum(shadowed, 255)], dtype=np.uint8)
             if len(self._table_colors) > _CACHED_SHADES:
                 self._table_colors.popitem(last=False)
         return self._table_colors[key]
 
-    def _pixels_alone(self, i: int, bodies: Sequence[int], scene: Scene) -> int:
-        """How many pixels of the image object i covers when nothing hides it."""
-        camera = scene.camera
-        corners, depth = project(camera, vertices(scene.objects[i]))
-        if (depth > camera.near).all():
-            rows, columns, x, y = _window(corners, camera)
-            return int(_inside(_hull(corners), x, y).sum()) if rows and columns else 0
-        # Partly behind the camera, the silhouette is not the hull of the corners: look.
-        for j, body in enumerate(bodies):
+    def _pixels_alone(self, i: int, scene: Scene) -> int:
+        """How many pixels object i, partly behind the camera, covers when nothing hides it."""
+        for j in range(len(scene.objects)):
             if j != i:
-                self._put(body, _PARKED, 0.0)
-        _, segments = self._picture(camera, scene.light)
-        for body, box in zip(bodies, scene.objects, strict=True):
-            self._put(body, box.position, box.yaw)
-        return int((segments == bodies[i]).sum())
+                self._put(j, _PARKED, 0.0)
+        _, bodies = self._picture(scene.camera, scene.light)
+        for j, box in enumerate(scene.objects):
+            self._put(j, box.position, box.yaw)
+        return int((bodies == i).sum())
 
 
 def rejects(rendering: Rendering) -> str | None:
@@ -269,200 +291,18 @@ def rejects(rendering: Rendering) -> str | None:
     return None
 
 
-def _textured(
-    scene: Scene, first: tuple[np.uint32, np.uint32], second: tuple[np.uint32, np.uint32]
-) -> tuple[np.ndarray, np.ndarray]:
-    """The table's pixels in the light and in a shadow, packed, (H, W) each.
-
-    Both colours of the texture come with their shades; the pattern blends those.
-    """
-    texture = scene.table.texture
-    assert texture is not None, "a plain table has one shade"
-    on_table, x, y = _ground(scene.camera, scene.table)
-    share = pattern(texture, x[on_table], y[on_table])[:, None]
-    blended = []
-    for one, other in zip(first, second, strict=True):
-        a, b = (_unpack(np.array([[word]]))[0, 0].astype(float) for word in (one, other))
-        pixels = np.full((*on_table.shape, 4), 255, dtype=np.uint8)
-        pixels[on_table, :3] = np.rint(a + share * (b - a))
-        blended.append(pixels.view(np.uint32)[..., 0])
-    return blended[0], blended[1]
-
-
-def _fill_ground(
-    words: np.ndarray,
-    empty: np.ndarray,
-    scene: Scene,
-    lit: np.uint32 | np.ndarray,
-    shadowed: np.uint32 | np.ndarray,
-) -> None:
-    """Paint table, its shadows and the floor where no box is: packed pixels, in place.
-
-    lit, shadowed: the table's pixels, one for all or (H, W).
-    """
-    camera, source = scene.camera, _source(scene.light)
-    on_table, x_ground, y_ground = _ground(camera, scene.table)
-    picture = np.where(on_table, lit, _FLOOR)
-    shadowed = np.broadcast_to(shadowed, picture.shape)
-    for box in scene.objects if scene.light.shadow else ():
-        if source[2] <= box.top:
-            continue  # The light stands lower than the box: no shadow falls on the table.
-        cast = _cast(box, source)
-        pixels, depth = project(camera, np.hstack([cast, np.zeros((8, 1))]))
-        if (depth > camera.near).all():
-            rows, columns, _, _ = _window(pixels, camera)
-        else:
-            rows, columns = slice(0, camera.height), slice(0, camera.width)
-        if rows and columns:
-            where = (rows, columns)
-            dark = _inside(_hull(cast), x_ground[where], y_ground[where]) & on_table[where]
-            np.copyto(picture[where], shadowed[where], where=dark)
-    np.copyto(words, picture, where=empty)
-
-
-def _shade_boxes(image: np.ndarray, mask: np.ndarray, scene: Scene) -> None:
-    """Darken what a box shows in the shadow of other boxes, in place."""
-    light, source, eye = scene.light, _source(scene.light), np.array(scene.camera.eye)
-    rays = _rays(scene.camera)
-    low, high = _shadow_bounds(scene.objects, source)
-    all_rows, all_columns = np.nonzero(mask)
-    shown = mask[all_rows, all_columns]
-    for i, box in enumerate(scene.objects):
-        centre, extents = np.array(box.position[:2]), np.array(box.extents)
-        near_it = np.all((low <= centre + extents) & (high >= centre - extents), axis=1)
-        casters = [
-            other
-            for j, other in enumerate(scene.objects)
-            if near_it[j] and j != i and other.top > box.bottom
-        ]
-        if not casters:
-            continue
-        mine = shown == i + 1
-        rows, columns = all_rows[mine], all_columns[mine]
-        sight = rays[rows, columns]
-        points = eye + _crossing(box, eye, sight)[0][:, None] * sight
-        dark = np.zeros(len(points), dtype=bool)
-        for other in casters:
-            near, far = _crossing(other, points, source - points)
-            dark |= (near < far) & (far > 1e-6) & (near < 1)
-        rows, columns = rows[dark], columns[dark]
-        ambient = 255 * light.ambient * np.array(box.color)
-        direct = np.maximum(image[rows, columns] - ambient, 0)
-        image[rows, columns] = (ambient + _SHADOWED * direct).astype(np.uint8)
-
-
 def _source(light: Light) -> np.ndarray:
     """Where TinyRenderer's light stands, world frame (3,), m."""
     direction = np.array(light.direction)
     return direction / np.linalg.norm(direction) * light.distance
 
 
-def _cast(box: Box, source: np.ndarray) -> np.ndarray:
-    """Where the rays from the light through a box's corners meet the table plane, (8, 2)."""
-    corners = vertices(box)
-    rays = corners - source
-    return (source + rays * (source[2] / -rays[:, 2:]))[:, :2]
-
-
-def _shadow_bounds(boxes: Sequence[Box], source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of each box together with its shadow, lowest and highest x and y, each (N, 2)."""
-    low, high = np.full((len(boxes), 2), -np.inf), np.full((len(boxes), 2), np.inf)
-    for i, box in enumerate(boxes):
-        if source[2] > box.top:
-            both = np.vstack([_cast(box, source), box.corners()])
-            low[i], high[i] = both.min(axis=0), both.max(axis=0)
-    return low, high
-
-
-def _crossing(
-    box: Box, origins: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays (K, 3) enter and leave a box, in multiples of the direction, each (K,).
-
-    A ray that misses enters later than it leaves.
-    """
-    c, s = math.cos(box.yaw), math.sin(box.yaw)
-    T_box_world = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    start = (origins - np.array(box.position)) @ T_box_world.T
-    along = directions @ T_box_world.T
-    half = np.array(box.size) / 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = (-half - start) / along, (half - start) / along
-    # 0 / 0: the ray runs within a face; let the other axes decide.
-    near = np.nan_to_num(np.minimum(a, b), nan=-np.inf, neginf=-np.inf, posinf=np.inf)
-    far = np.nan_to_num(np.maximum(a, b), nan=np.inf, neginf=-np.inf, posinf=np.inf)
-    return near.max(axis=-1), far.min(axis=-1)
+def _silhouettes(boxes: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """`silhouettes` of rows (N, ROW) in a camera's picture."""
+    return silhouettes(boxes, *pinhole(camera), camera.width, camera.height, camera.near)
 
 
 @lru_cache(maxsize=8)
-def _rays(camera: Camera) -> np.ndarray:
-    """Direction of sight of every pixel, (H, W, 3): the inverse of `project`.
-
-    At TinyRenderer's sample points (see `_window`), with unit depth along the optical axis.
-    """
-    forward = np.array(camera.target) - np.array(camera.eye)
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, camera_up(camera))
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
-    focal = camera.width / 2 / math.tan(math.radians(camera.fov) / 2)
-    u = (np.arange(camera.width) - camera.width / 2) / focal
-    v = (np.arange(camera.height) + 1 - camera.height / 2) / focal
-    return forward + u[None, :, None] * right + v[:, None, None] * down
-
-
-@lru_cache(maxsize=8)
-def _ground(camera: Camera, table: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where each pixel meets the plane z = 0: on the table or not, x and y, each (H, W)."""
-    rays = _rays(camera)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = -camera.eye[2] / rays[..., 2]
-        x = camera.eye[0] + scale * rays[..., 0]
-        y = camera.eye[1] + scale * rays[..., 1]
-        half_x, half_y = table.size[0] / 2, table.size[1] / 2
-        on_table = (scale > 0) & (np.abs(x) <= half_x) & (np.abs(y) <= half_y)
-    # Rays that miss the plane have no point; nobody asks for one off the table.
-    return on_table, np.where(on_table, x, 0.0), np.where(on_table, y, 0.0)
-
-
-def _window(
-    pixels: np.ndarray, camera: Camera
-) -> tuple[slice | None, slice | None, np.ndarray, np.ndarray]:
-    """Rows and columns around projected points (None when off the image) and sample points.
-
-    TinyRenderer samples pixel (row, column) at x = column, y = row + 1: with these the
-    closed-form silhouettes equal the rendered ones pixel by pixel.
-    """
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
-    left, right = max(math.floor(low[0]), 0), min(math.ceil(high[0]) + 1, camera.width)
-    upper, lower = max(math.floor(low[1]) - 1, 0), min(math.ceil(high[1]) + 1, camera.height)
-    if left >= right or upper >= lower:
-        return None, None, np.empty(0), np.empty(0)
-    x, y = np.arange(left, right)[None, :], np.arange(upper, lower)[:, None] + 1
-    return slice(upper, lower), slice(left, right), x, y
-
-
-def _hull(points: np.ndarray) -> np.ndarray:
-    """Convex hull of points (K, 2), counter-clockwise (M, 2): the monotone chain."""
-    ordered = sorted(map(tuple, points.tolist()))
-
-    def chain(sequence: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-        hull: list[tuple[float, float]] = []
-        for x, y in sequence:
-            while len(hull) > 1:
-                (ax, ay), (bx, by) = hull[-2], hull[-1]
-                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
-                    break
-                hull.pop()
-            hull.append((x, y))
-        return hull[:-1]
-
-    return np.array(chain(ordered) + chain(ordered[::-1]))
-
-
-def _inside(hull: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Which points lie in a counter-clockwise convex polygon (M, 2), borders included."""
-    inside = np.ones(np.broadcast(x, y).shape, dtype=bool)
-    for (ax, ay), (bx, by) in zip(hull, np.roll(hull, -1, axis=0), strict=True):
-        inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0
-    return inside
+def _ground(camera: Camera, table: Table) -> np.ndarray:
+    """Where each pixel meets the table, x and y (2, H, W), m, NaN off it."""
+    return ground(*pinhole(camera), camera.width, camera.height, np.array(table.size) / 2)

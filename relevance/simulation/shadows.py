@@ -1,0 +1,249 @@
+"""The closed-form parts of a picture: ground, shadows, silhouettes and the shrinking of views.
+
+Compiled loops over pixels. Boxes are rows as `relevance.sampling.rows` has them; eye, axes and
+focal length are those of `pinhole`. TinyRenderer samples pixel (row, column) at x = column,
+y = row + 1: with these points the silhouettes equal the rendered ones pixel by pixel.
+
+H, W pixels; N boxes.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from relevance.sampling import bound, corners, crossing, extents, projected
+
+SHADOWED = 0.8
+"""The share of direct light that TinyRenderer leaves in a shadow."""
+
+
+@njit(cache=True, error_model="numpy")
+def ground(eye, axes, focal, width, height, table):
+    """Where each pixel meets a table of half edges (2,), m: x and y (2, H, W), NaN off it."""
+    points = np.empty((2, height, width))
+    for row in range(height):
+        for column in range(width):
+            dx, dy, dz = _sight(axes, focal, width, height, row, column)
+            scale = -eye[2] / dz
+            x, y = eye[0] + scale * dx, eye[1] + scale * dy
+            on_table = scale > 0 and abs(x) <= table[0] and abs(y) <= table[1]
+            points[0, row, column] = x if on_table else np.nan
+            points[1, row, column] = y if on_table else np.nan
+    return points
+
+
+@njit(cache=True, error_model="numpy")
+def paint(pixels, bodies, boxes, ambient, points, eye, axes, focal, source, shades, floor):
+    """Table, floor and all shadows, around and on the boxes that pybullet drew.
+
+    pixels (H, W, 4) and bodies (H, W): RGBA and box indices (-1: none) of its picture. boxes
+    (N, ROW), ambient (N, 3): their colours in ambient light alone, 0..255. points: of `ground`.
+    source: where the light stands, (3,), m; (0,) for no shadows. shades: the table's
+    pixels in the light and in a shadow, (2, H, W, 3); floor: RGB.
+    Returns image (H, W, 3) and mask (H, W), uint8, and how many pixels each box shows (N,).
+    """
+    height, width = bodies.shape
+    image = np.empty((height, width, 3), np.uint8)
+    mask = np.empty((height, width), np.uint8)
+    visible = np.zeros(len(boxes), np.int64)
+    hulls, sizes, bounds, reaches = _shadows(boxes, source)
+    for row in range(height):
+        for column in range(width):
+            i = bodies[row, column]
+            mask[row, column] = i + 1
+            if i < 0:
+                x, y = points[0, row, column], points[1, row, column]
+                dark = 0
+                for j in range(len(boxes)):
+                    if (
+                        bounds[j, 0] <= x <= bounds[j, 2]
+                        and bounds[j, 1] <= y <= bounds[j, 3]
+                        and _inside(hulls[j], sizes[j], x, y)
+                    ):
+                        dark = 1
+                        break
+                for k in range(3):
+                    shade = floor[k] if math.isnan(x) else shades[dark, row, column, k]
+                    image[row, column, k] = shade
+            else:
+                visible[i] += 1
+                for k in range(3):
+                    image[row, column, k] = pixels[row, column, k]
+                sight = _sight(axes, focal, width, height, row, column)
+                if _in_shadow(i, boxes, reaches, eye, sight, source):
+                    for k in range(3):
+                        direct = max(image[row, column, k] - ambient[i, k], 0.0)
+                        image[row, column, k] = np.uint8(ambient[i, k] + SHADOWED * direct)
+    return image, mask, visible
+
+
+@njit(cache=True)
+def silhouettes(boxes, eye, axes, focal, width, height, near):
+    """How many pixels each box covers when alone, (N,), and the part of the picture around all.
+
+    The part (4,) is left, upper, right and lower pixel; the latter two are the first beyond. A
+    box that is partly nearer than `near`, m, is no hull of its corners: its count is -1, and
+    the part is the whole picture.
+    """
+    counts, part = np.zeros(len(boxes), np.int64), np.array([width, height, 0, 0])
+    hull, bounds = np.empty((16, 2)), np.empty(4)
+    for i in range(len(boxes)):
+        seen = projected(corners(boxes[i]), eye, axes, focal)
+        for k in range(8):
+            if seen[k, 2] <= near:
+                counts[i] = -1
+        if counts[i] < 0:
+            part[0], part[1], part[2], part[3] = 0, 0, width, height
+            continue
+        bound(seen, bounds)
+        left = max(math.floor(bounds[0] + width / 2), 0)
+        upper = max(math.floor(bounds[1] + height / 2) - 1, 0)
+        right = min(math.ceil(bounds[2] + width / 2) + 1, width)
+        lower = min(math.ceil(bounds[3] + height / 2) + 1, height)
+        if left >= right or upper >= lower:
+            continue  # outside the picture
+        part[0], part[1] = min(part[0], left), min(part[1], upper)
+        part[2], part[3] = max(part[2], right), max(part[3], lower)
+        size = _hull(seen, hull)
+        for row in range(upper, lower):
+            for column in range(left, right):
+                counts[i] += _inside(hull, size, column - width / 2, row + 1 - height / 2)
+    return counts, part
+
+
+@njit(cache=True)
+def halved(pixels, bodies, body, background):
+    """A picture (H, W, 4) at half its size, (H / 2, W / 2, 3) uint8, with one RGB around a body."""
+    height, width = bodies.shape[0] // 2, bodies.shape[1] // 2
+    view = np.empty((height, width, 3), np.uint8)
+    for row in range(height):
+        for column in range(width):
+            for k in range(3):
+                total = 2  # half of four, to round
+                for i in range(2 * row, 2 * row + 2):
+                    for j in range(2 * column, 2 * column + 2):
+                        total += pixels[i, j, k] if bodies[i, j] == body else background[k]
+                view[row, column, k] = total // 4
+    return view
+
+
+@njit(cache=True)
+def _sight(axes, focal, width, height, row, column):
+    """Direction of sight of a pixel with unit depth: the inverse of `project`."""
+    u, v = (column - width / 2) / focal, (row + 1 - height / 2) / focal
+    return (
+        axes[0, 2] + u * axes[0, 0] + v * axes[0, 1],
+        axes[1, 2] + u * axes[1, 0] + v * axes[1, 1],
+        axes[2, 2] + u * axes[2, 0] + v * axes[2, 1],
+    )
+
+
+@njit(cache=True)
+def _shadows(boxes, source):
+    """The shadows on the table plane: hulls (N, 16, 2) with their numbers of points (N,) and
+    bounds (N, 4), lowest x and y and highest; and which box (N) may darken which other, (N, N).
+    """
+    count = len(boxes)
+    hulls, sizes = np.empty((count, 16, 2)), np.zeros(count, np.int64)
+    bounds, reaches = np.empty((count, 4)), np.zeros((count, count), np.bool_)
+    cast, both = np.empty((8, 2)), np.empty(4)
+    bounds[:] = np.nan  # no shadow: nothing lies within
+    if len(source) == 0:
+        return hulls, sizes, bounds, reaches
+    for j in range(count):
+        for k in range(2):
+            both[k], both[2 + k] = -np.inf, np.inf
+        # A light that stands lower than the box casts no shadow of it on the table.
+        if source[2] > boxes[j, 2] + boxes[j, 5]:
+            points = corners(boxes[j])
+            for k in range(8):
+                scale = source[2] / (source[2] - points[k, 2])
+                for i in range(2):
+                    cast[k, i] = source[i] + (points[k, i] - source[i]) * scale
+            sizes[j] = _hull(cast, hulls[j])
+            bound(cast, bounds[j])
+            bound(points, both)
+            for k in range(2):
+                both[k] = min(both[k], bounds[j, k])
+                both[2 + k] = max(both[2 + k], bounds[j, 2 + k])
+        for i in range(count):
+            (x, y), (ex, ey) = (boxes[i, 0], boxes[i, 1]), extents(boxes[i])
+            reaches[i, j] = (
+                i != j
+                and boxes[j, 2] + boxes[j, 5] > boxes[i, 2] - boxes[i, 5]
+                and both[0] <= x + ex
+                and both[1] <= y + ey
+                and both[2] >= x - ex
+                and both[3] >= y - ey
+            )
+    return hulls, sizes, bounds, reaches
+
+
+@njit(cache=True)
+def _in_shadow(i, boxes, reaches, eye, sight, source):
+    """Whether the light misses what shows of box i along a line of sight (3,)."""
+    x = y = z = np.nan
+    for j in range(len(boxes)):
+        if not reaches[i, j]:
+            continue
+        if math.isnan(x):
+            (dx, dy, dz), (x, y, z) = sight, (eye[0], eye[1], eye[2])
+            enter, _ = crossing(boxes[i], x, y, z, dx, dy, dz)
+            x, y, z = x + enter * dx, y + enter * dy, z + enter * dz
+        enter, leave = crossing(boxes[j], x, y, z, source[0] - x, source[1] - y, source[2] - z)
+        if enter < leave and leave > 1e-6 and enter < 1:
+            return True
+    return False
+
+
+@njit(cache=True)
+def _hull(points, hull):
+    """Fill hull (2 K, 2) with the convex hull of points (K, 2 or more), counter-clockwise.
+
+    Returns its number of points; the monotone chain.
+    """
+    count = len(points)
+    order = np.arange(count)
+    for k in range(1, count):  # by x, then y
+        at = k
+        while at > 0:
+            p, q = order[at - 1], order[at]
+            if points[p, 0] < points[q, 0] or (
+                points[p, 0] == points[q, 0] and points[p, 1] <= points[q, 1]
+            ):
+                break
+            order[at - 1], order[at] = q, p
+            at -= 1
+    size = 0
+    for chain in range(2):
+        first = size
+        for k in range(count):
+            point = order[k if chain == 0 else count - 1 - k]
+            x, y = points[point, 0], points[point, 1]
+            while size - first > 1 and _turn(hull, size - 2, size - 1, x, y) <= 0:
+                size -= 1
+            hull[size, 0], hull[size, 1] = x, y
+            size += 1
+        size -= 1  # the last point is the first of the other chain
+    return size
+
+
+@njit(cache=True)
+def _inside(hull, size, x, y):
+    """Whether a point lies in a counter-clockwise convex polygon, borders included."""
+    before = size - 1
+    for k in range(size):
+        if _turn(hull, before, k, x, y) < 0:
+            return False
+        before = k
+    return True
+
+
+@njit(cache=True)
+def _turn(hull, a, b, x, y):
+    """Over 0 when (x, y) lies left of the line from one point of a hull to another."""
+    ax, ay = hull[a, 0], hull[a, 1]
+    return (hull[b, 0] - ax) * (y - ay) - (hull[b, 1] - ay) * (x - ax)
