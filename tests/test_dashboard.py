@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,8 @@ APP = Path(__file__).parent.parent / "dashboards" / "app.py"
 @pytest.fixture
 def page(monkeypatch):
     """Runs the page on a dataset folder."""
+    # Streamlit leaves the page as the main module; processes spawned later would run it.
+    monkeypatch.setitem(sys.modules, "__main__", sys.modules["__main__"])
 
     def run(dataset: Path) -> AppTest:
         monkeypatch.setattr("sys.argv", ["app.py", str(dataset)])

@@ -9,8 +9,9 @@ Goal regions that are free need no extra action, so uniformly scattered boxes gi
 relevant objects (2 to 4% of the queries). Scenes are therefore dense where it matters: boxes
 stand squarely in the goal regions of others (`crowding`), and in `on` scenes many of them carry
 another (`stacking`). Which of the valid goals are asked follows stated odds (`GoalConfig`) that
-look at the stacks, never at plans. With the defaults about 14% (same-plane) and 30% (`on`) of
-the queries are relevant, as in the paper. All of it is configuration, hence in every row's hash.
+look at the stacks, never at plans. With the defaults about 13% (same-plane) and 27% (`on`) of
+the queries are relevant; in the paper 14% and 30%. All of it is configuration, hence in every
+row's hash.
 """
 
 from relevance.sampling.colors import lab
