@@ -37,7 +37,7 @@ from relevance.labels import (
     timing_row,
 )
 from relevance.planner import plan, warm_up
-from relevance.sampling import sample_goals, sample_scene
+from relevance.sampling import SceneConfig, sample_goals, sample_scene
 from relevance.scene import Predicate, Scene, content_hash, scene_to_json
 from relevance.simulation import Renderer, Rendering, rejects, replay
 from relevance.store import Dataset, DatasetError, Labelling, copy_file
@@ -97,6 +97,7 @@ def generate_shard(
     refuse_merged(dataset)
     if generated(dataset, spec):
         return ShardReport(spec=spec, predicate=None, skipped=True, rows=spec.count)
+    _compile(_draw_one)
     watch = _Stopwatch()
     where: dict[str, Any] = {"split": spec.split, "shard": spec.shard}
     rows: list[dict[str, Any]] = []
@@ -194,7 +195,7 @@ def label_shard(
         return _labelling_report(spec, predicate, rows, skipped=False)
     planned = _planned(dataset, own, where)
     if not planned or aim.policy == "necessary":
-        _compile()
+        _compile(warm_up)
     watch = _Stopwatch()
     rows = dataset.read_rows("scenes", **scenes)
     if planned:
@@ -348,8 +349,8 @@ def _took(
 
 
 @cache
-def _compile() -> None:
-    """Compile the solvers, or load them; on each machine the first process does it for all."""
+def _compile(kernels: Callable[[], None]) -> None:
+    """Compile kernels, or load them; on each machine the first process does it for all."""
     file = Path(tempfile.gettempdir()) / f"relevance-{os.getuid()}-compile.lock"
     with file.open("w") as lock:
         try:
@@ -357,4 +358,11 @@ def _compile() -> None:
         except BlockingIOError:
             fcntl.flock(lock, fcntl.LOCK_SH)  # until the first one is done; then all go on
             fcntl.flock(lock, fcntl.LOCK_UN)
-        warm_up()
+        kernels()
+
+
+def _draw_one() -> None:
+    """Draw and render a scene, for what is compiled on the way."""
+    drawn = (sample_scene(SceneConfig(), seed=0, index=index) for index in range(ATTEMPTS))
+    with Renderer() as renderer:
+        renderer.render(next(scene for scene in drawn if scene is not None))
