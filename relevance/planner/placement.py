@@ -195,10 +195,9 @@ def find_pose(region, prefer, bottom, parts, obstacles, table, base, near, far, 
     """Branch and bound for a free pose whose centre lies in a rectangle.
 
     region: centre x, y, angle, half extents (5,). prefer (x, y): where to look first. ease: how
-    much every constraint is relaxed, m. Fills
-    pose (x, y, angle of the finger axis) with the first comfortable pose of the coarsest level
-    that has a free one, or the clearest of that level. Returns (FOUND | NONE | UNDECIDED, its
-    slack in m).
+    much every constraint is relaxed, m. Fills pose (x, y, angle of the finger axis) with the
+    first comfortable pose of the coarsest level that has a free one, or the clearest of that
+    level. Returns (FOUND | NONE | UNDECIDED, the slack of the best pose seen, m).
     """
     a, b = region[3], region[4]
     c, s = math.cos(region[2]), math.sin(region[2])
