@@ -7,7 +7,9 @@ PYTHON ?= python3
 DATASET ?= data/demo
 PRESET ?= demo
 WORKERS ?= $(shell nproc)
-TESTS ?= tests
+# One process compiles the solvers first, the other has tests meanwhile that need none.
+FIRST := planner rendering sampling scene store
+TESTS ?= $(FIRST:%=tests/test_%.py) $(wildcard tests/test_*.py)
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet

@@ -135,7 +135,7 @@ class TrainConfig:
         """
         return cls(
             preset="demo",
-            steps=2700,
+            steps=2200,
             scenes_per_batch=4,
             goals_per_scene=3,
             recolor=False,
