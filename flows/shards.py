@@ -6,6 +6,7 @@ after any kind of death goes on where the first one stopped.
 
 from __future__ import annotations
 
+import atexit
 import itertools
 import os
 import sys
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import cache
 from multiprocessing import connection, parent_process
 from pathlib import Path
 from typing import Any
@@ -103,30 +105,31 @@ def one_server() -> Iterator[None]:
         return
     server = SubprocessASGIServer()  # one object a process: the one that the flow itself uses
     server.start()
-    with temporary_settings({PREFECT_API_URL: server.api_url}), _ending_with(server):
+    _end_with(server)
+    with temporary_settings({PREFECT_API_URL: server.api_url}):
         yield
 
 
-@contextmanager
-def _ending_with(server: SubprocessASGIServer) -> Iterator[None]:
-    """End this process when its server dies meanwhile; else it would try to reach it for minutes.
+@cache
+def _end_with(server: SubprocessASGIServer) -> None:
+    """From now on end this process when its server dies; else it would try to reach it for minutes.
 
-    Finished shards stay, and the workers end with this process.
+    Finished shards stay, and the workers end with this process. Somebody's open session (a
+    notebook) is not ended.
     """
     process, over = server.server_process, threading.Event()
+    if process is None or hasattr(sys, "ps1"):
+        return
+    atexit.register(over.set)  # last in, first out: before the server's own stop
 
     def watch() -> None:
         while not over.wait(0.5):
-            if process is not None and process.poll() is not None and not over.is_set():
+            if process.poll() is not None and not over.is_set():
                 print("the flow's Prefect server died; start the flow again", file=sys.stderr)
                 sys.stderr.flush()
                 os._exit(1)
 
     threading.Thread(target=watch, name="end-with-server", daemon=True).start()
-    try:
-        yield
-    finally:
-        over.set()
 
 
 @contextmanager

@@ -263,7 +263,7 @@ def test_path_gradient_equals_finite_differences():
 
     def merit(rows):
         return path.assemble(
-            rows, at, body, obstacles, margin, samples, len(samples), targets, smooth, *multipliers,
+            rows, at, body, obstacles, margin, samples, targets, smooth, *multipliers,
             7.0, 0.0, band, g,
         )[0]  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import os
 import re
@@ -35,6 +36,7 @@ from relevance.store import (
     table_schema,
     type_name,
 )
+from relevance.store.images import MEMBERS, undecoded
 
 
 @dataclass(frozen=True)
@@ -464,6 +466,38 @@ def test_tar_members(dataset: Dataset) -> None:
             for member in ("mask.png", "scene.json", "scene.webp", "views.webp")
         ]
         assert {(item.mtime, item.uid, item.gid, item.uname) for item in tar} == {(0, 0, 0, "")}
+
+
+def test_webdataset_reads_the_same_members(dataset: Dataset) -> None:
+    import webdataset
+
+    scenes = fill(dataset)
+    path = dataset.images_path("train", 0)
+    theirs = list(webdataset.WebDataset(str(path), shardshuffle=False))
+    ours = list(undecoded(path.read_bytes(), str(path)))
+    assert [item["__key__"] for item in ours] == [scene.id for scene in scenes]
+    assert all(set(item) == {"__key__", "__url__", *MEMBERS} for item in ours)
+    assert [{k: item[k] for k in ("__key__", *MEMBERS)} for item in theirs] == [
+        {k: item[k] for k in ("__key__", *MEMBERS)} for item in ours
+    ]
+
+
+def test_a_tar_that_is_not_ours() -> None:
+    content = io.BytesIO()
+    with tarfile.open(fileobj=content, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        info = tarfile.TarInfo("s1.scene.json")
+        info.size = 600
+        tar.addfile(info, io.BytesIO(bytes(600)))
+    good = content.getvalue()
+    [item] = undecoded(good, "a.tar")
+    assert item == {"__key__": "s1", "__url__": "a.tar", "scene.json": bytes(600)}
+    for broken, message in (
+        (good[:1000], "a.tar: s1.scene.json: expected 600 bytes, the tar ends before"),
+        (good.replace(b"s1.scene.json", b"s1scenejson\0\0"), "a.tar: byte 0: expected the ustar"),
+        (good.replace(b"ustar", b"gnu  "), "a.tar: byte 0: expected the ustar header"),
+    ):
+        with pytest.raises(DatasetError, match=re.escape(message)):
+            list(undecoded(broken, "a.tar"))
 
 
 # queries ---------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ import tyro
 from relevance.cli import datasets
 from relevance.cli.arguments import CORES, DatasetArg, OptionalPath, Preset, Workers
 from relevance.cli.bench import bench_planner
-from relevance.cli.processes import in_processes
+from relevance.cli.processes import make_shards
 from relevance.cli.terminal import Format, UsageError, bar, bars, console, say, show, to_json
 
 OptionalName = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
@@ -47,7 +47,7 @@ def _generate(preset: Preset) -> Callable[..., int]:
         there = Dataset.open(dataset)
         missing = [spec for spec in specs if not generated(there, spec)]
         jobs = [(generate_shard, (dataset, config, spec)) for spec in missing]
-        in_processes("scenes", jobs, [spec.count for spec in missing], workers)
+        make_shards(dataset, jobs, [spec.count for spec in missing], workers)
         finish(dataset)
         say(f"{dataset}: {len(missing)} shards made, {len(specs) - len(missing)} were there")
         return 0
@@ -100,7 +100,7 @@ def _label(_: Preset) -> Callable[..., int]:
         missing = [pair for pair in pairs if not labelled(there, config, *pair, policy)]
         stage = functools.partial(label_shard, policy=policy)
         jobs = [(stage, (dataset, config, spec, predicate)) for spec, predicate in missing]
-        in_processes("scenes", jobs, [spec.count for spec, _ in missing], workers)
+        make_shards(dataset, jobs, [spec.count for spec, _ in missing], workers)
         finish(dataset)
         _, [(tasks, holds)] = sql(dataset, "select count(*), count_if(holds) from plans")
         say(f"{dataset}: {len(missing)} shards made, {len(pairs) - len(missing)} were there")

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from relevance.cli.arguments import CORES, DatasetArg, Preset, Workers
-from relevance.cli.processes import in_processes
+from relevance.cli.processes import in_processes, make_shards
 from relevance.cli.terminal import Format, UsageError, bar, say, show
 
 
@@ -171,9 +171,9 @@ def _repair(_: Preset) -> Callable[..., int]:
         specs = generation.prepare(dataset, config)
         missing = [spec for spec in specs if not generation.generated(there, spec)]
         jobs: list[Any] = [(generation.generate_shard, (dataset, config, s)) for s in missing]
-        in_processes("scenes", jobs, [spec.count for spec in missing], workers)
+        make_shards(dataset, jobs, [spec.count for spec in missing], workers)
         for policy in (None, *policies):
-            in_processes(*_labelling(dataset, config, specs, predicates, policy), workers)
+            make_shards(dataset, *_labelling(dataset, config, specs, predicates, policy), workers)
         generation.finish(dataset)
         with bar("files checked") as progress:
             left = check(dataset, progress=progress)
@@ -187,7 +187,7 @@ def _repair(_: Preset) -> Callable[..., int]:
 
 def _labelling(
     dataset: Path, config: Any, specs: Any, predicates: Any, policy: str | None
-) -> tuple[str, list[Any], list[int]]:
+) -> tuple[list[Any], list[int]]:
     from relevance.generation import label_shard, labelled
     from relevance.store import Dataset
 
@@ -200,7 +200,7 @@ def _labelling(
     ]
     stage = functools.partial(label_shard, policy=policy)
     jobs = [(stage, (dataset, config, spec, predicate)) for spec, predicate in pairs]
-    return "scenes", jobs, [spec.count for spec, _ in pairs]
+    return jobs, [spec.count for spec, _ in pairs]
 
 
 def _compact(_: Preset) -> Callable[..., int]:

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from pathlib import Path
 from typing import Any
 
 from relevance.cli.terminal import UsageError, bar
@@ -64,9 +65,20 @@ def in_processes(
                 progress(counter.value, sum(sizes))
         return [future.result() for future in futures]
     except BaseException:
-        # A shard that is under way leaves nothing behind: its file appears by a rename at the end.
+        # Nothing half-made can pass for a shard: a file appears by a rename at the end.
         for process in list((pool._processes or {}).values()):
             process.terminate()
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def make_shards(dataset: Path, jobs: Sequence[Job], sizes: Sequence[int], n: int) -> None:
+    """Run jobs that write a dataset's shards; those cut short leave no temporary file."""
+    # Here and not above: `relevance --help` reads this file and loads no pyarrow.
+    from relevance.store import locate, sweep
+
+    try:
+        in_processes("scenes", jobs, sizes, n)
+    finally:
+        sweep(locate(dataset))

@@ -17,7 +17,6 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 from numba import njit
-from scipy.spatial import ConvexHull
 
 from relevance.planner.kernels.native import Native, call, load
 from relevance.simulation import panda_urdf
@@ -244,6 +243,9 @@ def _box(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _slice(vertices: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
     """Bounding box of the part of the convex hull between two heights."""
+    # Here and not above: it takes most of a second to load, and only reading the URDF needs it.
+    from scipy.spatial import ConvexHull
+
     inside = vertices[(vertices[:, 2] >= low) & (vertices[:, 2] <= high)]
     cuts = [inside]
     for plane in (low, high):

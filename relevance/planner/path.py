@@ -117,8 +117,8 @@ def smoothness(T):
 
 @njit(cache=True)
 def assemble(
-    X, arm, bodies, obstacles, margin, samples, n_samples, targets, smooth, eq, ineq, limit, mu,
-    gain, band, g,
+    X, arm, bodies, obstacles, margin, samples, targets, smooth, eq, ineq, limit, mu, gain, band,
+    g,
 ):  # fmt: skip
     """Merit and Gauss-Newton model of the rows 1..T-1.
 
@@ -167,7 +167,7 @@ def assemble(
     index, row = np.zeros(2 * ARM, np.int64), np.zeros(2 * ARM)
     part, q = np.zeros(ARM), np.zeros(ARM)
     p, R, normal, contact = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
-    for n in range(n_samples):
+    for n in range(len(samples)):
         t, alpha = int(samples[n, 0]), samples[n, 1]
         for i in range(ARM):
             q[i] = X[t, i] if alpha == 0.0 else (1 - alpha) * X[t, i] + alpha * X[t + 1, i]
@@ -207,7 +207,7 @@ def assemble(
 
 
 @njit(cache=True)
-def solve(X, arm, bodies, obstacles, margin, samples, n_samples, targets):
+def solve(X, arm, bodies, obstacles, margin, samples, targets):
     """Improve the rows X (T + 1, 7) in place, first and last fixed; returns the violation.
 
     targets (T + 1, 5): hand target (x, y, z, finger angle) of the vertical rows, last column 1
@@ -222,8 +222,8 @@ def solve(X, arm, bodies, obstacles, margin, samples, n_samples, targets):
     mu, gain, worst = 1000.0, 0.0, 1e9
     for outer in range(8):
         merit, worst = assemble(
-            X, arm, bodies, obstacles, margin, samples, n_samples, targets, smooth, eq, ineq, limit,
-            mu, gain, band, g,
+            X, arm, bodies, obstacles, margin, samples, targets, smooth, eq, ineq, limit, mu, gain,
+            band, g,
         )  # fmt: skip
         for _ in range(12):
             for i in range(n):
@@ -242,8 +242,8 @@ def solve(X, arm, bodies, obstacles, margin, samples, n_samples, targets):
                     for i in range(ARM):
                         X[t, i] = old[t, i] + scale * step[(t - 1) * ARM + i]
                 new, worst = assemble(
-                    X, arm, bodies, obstacles, margin, samples, n_samples, targets, smooth, eq,
-                    ineq, limit, mu, 0.0, band, g,
+                    X, arm, bodies, obstacles, margin, samples, targets, smooth, eq, ineq,
+                    limit, mu, 0.0, band, g,
                 )  # fmt: skip
                 if new <= merit + 1e-4 * scale * slope + 1e-12:
                     break
@@ -333,12 +333,6 @@ def motion(X, arm, leave, leaving, arrive, bodies, obstacles) -> tuple[float, fl
     free. Returns the worst penetration (m; -1 where no motion was found that keeps the dense
     check within ALLOWED), the cost (rad^2) and the time between rows (s).
     """
-    depth = _motion(X, arm, leave, leaving, arrive, bodies, obstacles)
-    return depth, acceleration_cost(X), time_step(arm, X)
-
-
-@njit(cache=True)
-def _motion(X, arm, leave, leaving, arrive, bodies, obstacles):
     shape = (len(bodies.link), len(obstacles))
     first, last = np.zeros(shape), np.zeros(shape)
     distances(arm, X[0], bodies, obstacles, first)
@@ -348,10 +342,10 @@ def _motion(X, arm, leave, leaving, arrive, bodies, obstacles):
         for w in range(len(obstacles)):
             margin[b, w] = min(CLEARANCE, first[b, w], last[b, w]) - 1e-4
             if margin[b, w] < -ALLOWED:
-                return -1.0
+                return -1.0, 0.0, 0.0
     targets = np.zeros((ROWS + 1, 5))
     if not _guess(X, arm, leave, leaving, arrive, bodies, obstacles, targets):
-        return -1.0
+        return -1.0, 0.0, 0.0
     samples = np.zeros((2 * ROWS + (_EXCHANGES - 1) * ROWS, 2))
     n = 0
     for t in range(ROWS):
@@ -362,19 +356,21 @@ def _motion(X, arm, leave, leaving, arrive, bodies, obstacles):
     broken = np.zeros((ROWS, 2))
     depth = 0.0
     for _ in range(_EXCHANGES):
-        if solve(X, arm, bodies, obstacles, margin, samples, n, targets) > 1.5e-3:
-            return -1.0
+        if solve(X, arm, bodies, obstacles, margin, samples[:n], targets) > 1.5e-3:
+            return -1.0, 0.0, 0.0
         depth = dense_check(X, arm, bodies, obstacles, margin, broken)
         most = 0.0
         for t in range(ROWS):
             most = max(most, broken[t, 1])
         if depth <= 0.5 * ALLOWED and most < 1.2e-3:
-            return depth
+            break
         for t in range(ROWS):
             if broken[t, 1] > TOLERANCE and n < len(samples) and 0 < broken[t, 0] < 1:
                 samples[n, 0], samples[n, 1] = t, broken[t, 0]
                 n += 1
-    return depth if depth <= 0.8 * ALLOWED else -1.0
+    if depth > 0.8 * ALLOWED:
+        return -1.0, 0.0, 0.0
+    return depth, acceleration_cost(X), time_step(arm, X)
 
 
 @njit(cache=True)

@@ -1,8 +1,8 @@
 """A dataset folder: its shards, tables and image tars, and DuckDB over them.
 
 Every file is written to a temporary name and renamed; it exists whole or not at all. The
-scenes file of a shard carries the hash of the shard's tar. Tars are written with the standard
-library and read with webdataset, whose import loads torch: workers that make shards stay light.
+scenes file of a shard carries the hash of the shard's tar, a WebDataset that any reader of those
+takes. webdataset itself shuffles here; its import loads torch, which making shards does not need.
 
 Plans and labels of another planner version, goal set or label policy live beside the current
 ones, in `beside/planner=V/config=HASH/`, see `Labelling`. A merged dataset holds the shards of

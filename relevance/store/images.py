@@ -5,8 +5,6 @@ Everything is lossless: a stored scene renders again to equal pixels, and a test
 
 from __future__ import annotations
 
-import io
-import tarfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -71,22 +69,32 @@ def _encoded(extension: str, image: np.ndarray, options: list[int]) -> bytes:
 
 
 def undecoded(content: bytes, url: str) -> Iterator[dict[str, Any]]:
-    """The samples of an image tar, members by name, as webdataset groups them.
+    """The samples of an image tar, members by name, grouped as webdataset groups them.
 
-    webdataset would read the tar as a stream, member after member; in memory they are slices.
+    webdataset reads a tar as a stream and through `tarfile`, ten times slower than the headers
+    that `write_images` wrote can be read: ustar, names shorter than 100 bytes, no links. Raises
+    DatasetError for anything else.
     """
-    # Here and not above: importing webdataset loads torch.
-    from webdataset.tariterators import group_by_keys
-
-    with tarfile.open(fileobj=io.BytesIO(content), mode="r:") as tar:
-        yield from group_by_keys(
-            {
-                "fname": m.name,
-                "data": content[m.offset_data : m.offset_data + m.size],
-                "__url__": url,
-            }
-            for m in tar
-        )
+    item: dict[str, Any] = {}
+    at = 0
+    while at < len(content) and content[at]:  # an empty header ends the tar
+        name = content[at : at + 100].rstrip(b"\0").decode("ascii", "replace")
+        key, dot, member = name.partition(".")
+        size = content[at + 124 : at + 135]
+        start = at + 512
+        if not dot or content[at + 257 : at + 262] != b"ustar" or not size.isdigit():
+            raise DatasetError(f"{url}: byte {at}: expected the ustar header of KEY.MEMBER")
+        end = start + int(size, 8)
+        if end > len(content):
+            raise DatasetError(f"{url}: {name}: expected {end - start} bytes, the tar ends before")
+        if key != item.get("__key__"):
+            if item:
+                yield item
+            item = {"__key__": key, "__url__": url}
+        item[member] = content[start:end]
+        at = end + -end % 512
+    if item:
+        yield item
 
 
 def decode(item: Mapping[str, Any]) -> Sample:
