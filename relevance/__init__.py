@@ -37,7 +37,10 @@ def _kernel_cache(package: Path) -> Path:
     return cache / "relevance" / f"kernels-{digest[:16]}"
 
 
-os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_cache(Path(__file__).parent)))
+_cache = _kernel_cache(Path(__file__).parent)
+# Inherited from a process that began before the sources changed, it is not what the user chose.
+if Path(os.environ.get("NUMBA_CACHE_DIR", _cache)).parent == _cache.parent:
+    os.environ["NUMBA_CACHE_DIR"] = str(_cache)
 
 _HOMES = {
     "Dataset": "relevance.store",

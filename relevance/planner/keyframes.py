@@ -70,8 +70,9 @@ class Switches(NamedTuple):
     """(m,) obstacle on which box j is placed."""
     region: np.ndarray
     """(5,) goal region of the last box's centre: x, y, angle, half extents."""
-    table: np.ndarray
-    """(m, 2) bounds of |x| and |y| of each placement."""
+    bounds: np.ndarray
+    """(m, 4): of |x| and |y| of each placement, and of its distance from the base (near, far)
+    so that the hand can rise from it."""
 
 
 def bodies(opening: float, carried: tuple | None = None) -> Bodies:
@@ -219,8 +220,10 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                 worst = max(worst, violated)
     for j in range(m):
         at = first + 3 * j
-        for side in range(8):
-            # 0..3: the goal region of the last placement; 4..7: the table's edge
+        ox, oy = x[at] - arm.base[0], x[at + 1] - arm.base[1]
+        distance = max(math.sqrt(ox * ox + oy * oy), 1e-6)
+        for side in range(10):
+            # 0..3: the goal region of the last placement; 4..7: the table's edge; 8, 9: reach
             if side < 4 and j < m - 1:
                 continue
             sign = 1.0 if side % 2 == 0 else -1.0
@@ -232,10 +235,13 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                     row[0], row[1] = -sign * s, sign * c
                 bound = region[3] if side < 2 else region[4]
                 value = row[0] * (x[at] - region[0]) + row[1] * (x[at + 1] - region[1]) - bound
-            else:
+            elif side < 8:
                 row[0], row[1] = (sign, 0.0) if side < 6 else (0.0, sign)
-                bound = switches.table[j, 0 if side < 6 else 1]
+                bound = switches.bounds[j, 0 if side < 6 else 1]
                 value = row[0] * x[at] + row[1] * x[at + 1] - bound
+            else:
+                row[0], row[1] = sign * ox / distance, sign * oy / distance
+                value = sign * (distance - switches.bounds[j, 3 if side == 8 else 2])
             index[0], index[1] = at, at + 1
             edge[j, side] = max(0.0, edge[j, side] + gain * value)
             got, violated = _push(H, g, index, row, 2, value, edge[j, side], mu, False)
@@ -254,7 +260,7 @@ def solve(x, arm, switches, p0, weight):
     """
     n, m = len(x), len(switches.place_z)
     H, g = np.zeros((n, n)), np.zeros(n)
-    eq, limit, edge = np.zeros((2 * m, 6)), np.zeros((2 * m, ARM, 2)), np.zeros((m, 8))
+    eq, limit, edge = np.zeros((2 * m, 6)), np.zeros((2 * m, ARM, 2)), np.zeros((m, 10))
     ineq = np.zeros((2 * m, switches.link.shape[1], len(switches.obstacles)))
     old, step = x.copy(), np.zeros(n)
     mu, gain, worst, before = 1000.0, 0.0, 1e9, 1e9

@@ -29,7 +29,7 @@ from relevance.planner.kinematics import (
 from relevance.planner.placement import EDGE, FOUND, NONE, UNDECIDED, Grasp
 from relevance.scene import Box, Goal, Phase, Pose, Predicate, Scene, region
 
-REGION_MARGIN = 0.001
+REGION_MARGIN = 0.0005
 """How far inside the goal region a subject is placed, m."""
 TABLE_MARGIN = 0.005
 REACH_MARGIN = 0.004
@@ -320,7 +320,7 @@ class Problem:
         centre, half = np.zeros((2 * m, widest, 3)), np.zeros((2 * m, widest, 3))
         radius = np.zeros((2 * m, widest))
         pick, place_z, turn = np.zeros((m, 4)), np.zeros(m), np.zeros((m, 2))
-        table = np.zeros((m, 2))
+        bounds = np.zeros((m, 4))
         x = np.zeros(17 * m)
         p0, weight = np.zeros(3 * m), np.zeros(3 * m)
         reference = self.boxes[self.goal.reference]
@@ -344,8 +344,9 @@ class Problem:
                 stands[k, self.index[name]] = False
             c, s = abs(math.cos(place.pose[2])), abs(math.sin(place.pose[2]))
             along, across = grasp.parts[0, 1], grasp.parts[0, 2]
-            table[j] = self.table
-            table[j] -= c * along + s * across, s * along + c * across
+            bounds[j, :2] = self.table
+            bounds[j, :2] -= c * along + s * across, s * along + c * across
+            bounds[j, 2:] = self._interval(bottom, box, grasp)
             target = np.array([*place.pose[:2], place_z[j], place.pose[2]])
             for k, t in ((2 * j, pick[j]), (2 * j + 1, target)):
                 q = x[k * ARM : (k + 1) * ARM]
@@ -354,7 +355,7 @@ class Problem:
         x[14 * m :] = p0
         switches = keyframes.Switches(
             HOME, pick, place_z, turn, link, centre, half, radius, n_bodies, self.obstacles, stands,
-            moved, supports, self.goal_region(reference), table,
+            moved, supports, self.goal_region(reference), bounds,
         )  # fmt: skip
         start = x.copy()
         for stay in keyframes.STAY:

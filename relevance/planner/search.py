@@ -35,7 +35,7 @@ from relevance.scene import (
     goal_holds,
 )
 
-PLANNER_VERSION = "3"
+PLANNER_VERSION = "4"
 ORDERS = 6
 """How many orders of a set `informed` tries."""
 COST_TOLERANCE = 1e-3
