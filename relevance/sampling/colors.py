@@ -7,6 +7,7 @@ by the light and writes the result.
 from __future__ import annotations
 
 import math
+from operator import itemgetter
 
 import numpy as np
 
@@ -68,20 +69,18 @@ def draw_colors(
     as CIE 1976 Delta E. With n > 11 colours it shrinks by (11 / n)^(1/2). None when they could
     not be found.
     """
-    space = lab if perceptual else np.asarray
-    words, anchors = list(COLOR_NAMES), np.array(list(COLOR_NAMES.values()))
-    taken = np.array([space(np.array(color)) for color in avoid])
+    anchors = list(COLOR_NAMES.items())
+    taken = [_place(color, perceptual) for color in avoid]
     least = (distance * min(1.0, math.sqrt(FEW / count))) ** 2
     named: dict[str, Color] = {}
     for _ in range(200 * count):
         color = from_hsv(rng.uniform(0, 1), rng.uniform(0.55, 1), rng.uniform(0.4, 1))
-        place = space(color)
-        if ((taken - place) ** 2).sum(axis=1).min() < least:
+        place = _place(color, perceptual)
+        if min(_apart(place, other) for other in taken) < least:
             continue
-        nearest = np.argsort(((anchors - color) ** 2).sum(axis=1), kind="stable")
-        name = next(words[i] for i in nearest if words[i] not in named)
-        taken = np.vstack([taken, place])
-        named[name] = (float(color[0]), float(color[1]), float(color[2]))
+        free = ((_apart(anchor, color), word) for word, anchor in anchors if word not in named)
+        taken.append(place)
+        named[min(free, key=itemgetter(0))[1]] = color
         if len(named) == count:
             return list(named.items())
     return None
@@ -102,8 +101,23 @@ _TO_XYZ = np.array(  # IEC 61966-2-1
 )
 
 
-def from_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
-    """RGB (3,) of a hue, saturation and value in 0..1, rounded to 0.001."""
-    k = (np.array([5.0, 3.0, 1.0]) + 6 * hue) % 6
-    shade = np.maximum(np.minimum(np.minimum(k, 4 - k), 1), 0)  # np.clip is slow on so few
-    return np.round(value * (1 - saturation * shade), 3)
+def from_hsv(hue: float, saturation: float, value: float) -> Color:
+    """RGB of a hue, saturation and value in 0..1, rounded to 0.001."""
+    red, green, blue = (
+        round(1000 * value * (1 - saturation * max(min(k, 4 - k, 1), 0))) / 1000
+        for k in ((offset + 6 * hue) % 6 for offset in (5.0, 3.0, 1.0))
+    )
+    return red, green, blue
+
+
+# Plain floats: numpy takes ten times as long for three numbers.
+def _apart(a: Color, b: Color) -> float:
+    return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
+
+
+def _place(color: Color, perceptual: bool) -> Color:
+    """Where a colour is in the space whose distances count."""
+    if not perceptual:
+        return color
+    x, y, z = lab(np.array(color)).tolist()
+    return x, y, z

@@ -145,7 +145,10 @@ class Renderer:
             physicsClientId=self._client,
         )
         return pybullet.createMultiBody(
-            baseMass=0.0, baseVisualShapeIndex=shape, physicsClientId=self._client
+            baseMass=0.0,
+            baseVisualShapeIndex=shape,
+            useMaximalCoordinates=True,  # one rigid body without links, quicker to make
+            physicsClientId=self._client,
         )
 
     def _put(self, body: int, position: Sequence[float], yaw: float) -> None:

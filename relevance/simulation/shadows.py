@@ -50,6 +50,13 @@ def paint(pixels, bodies, boxes, ambient, points, eye, axes, focal, source, shad
     mask = np.empty((height, width), np.uint8)
     visible = np.zeros(len(boxes), np.int64)
     hulls, sizes, bounds, reaches = _shadows(boxes, source)
+    every = np.array([np.inf, np.inf, -np.inf, -np.inf])  # bounds of all shadows
+    for j in range(len(bounds)):
+        for k in range(2):
+            if bounds[j, k] < every[k]:  # not so where there is no shadow
+                every[k] = bounds[j, k]
+            if bounds[j, 2 + k] > every[2 + k]:
+                every[2 + k] = bounds[j, 2 + k]
     for row in range(height):
         for column in range(width):
             i = bodies[row, column]
@@ -57,7 +64,8 @@ def paint(pixels, bodies, boxes, ambient, points, eye, axes, focal, source, shad
             if i < 0:
                 x, y = points[0, row, column], points[1, row, column]
                 dark = 0
-                for j in range(len(boxes)):
+                shaded = every[0] <= x <= every[2] and every[1] <= y <= every[3]
+                for j in range(len(boxes) if shaded else 0):
                     if (
                         bounds[j, 0] <= x <= bounds[j, 2]
                         and bounds[j, 1] <= y <= bounds[j, 3]
