@@ -6,7 +6,7 @@ A maker imports only what its own flags need; the function imports the rest when
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import dataclasses
 import functools
-import subprocess
+import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -400,7 +400,8 @@ def _dashboard(_: Preset) -> Callable[..., int]:
         }
         flags = [f"--{name}={value}" for name, value in options.items()]
         command = [sys.executable, "-m", "streamlit", "run", str(app), *flags, "--", str(dataset)]
-        return subprocess.run(command, check=False).returncode
+        sys.stdout.flush()
+        os.execv(sys.executable, command)  # who ends this command ends the page
 
     return dashboard
 
