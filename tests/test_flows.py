@@ -26,7 +26,7 @@ from flows.plugin import FLOWS, full_name, wrap_read_deployment
 ROOT = Path(__file__).parent.parent
 BIN = Path(sys.executable).parent
 FEW = {
-    "train.same_plane": 6,
+    "train.same_plane": 2,
     "train.on": 2,
     "validation.same_plane": 2,
     "validation.on": 2,
@@ -35,7 +35,7 @@ FEW = {
     "scenes_per_shard": 2,
     "goals_per_scene": 1,
 }
-"""Overrides of the smoke preset: 8 shards of 2 scenes."""
+"""Overrides of the smoke preset: 6 shards of 2 scenes."""
 
 
 # --- parameters --------------------------------------------------------------------------
@@ -165,8 +165,8 @@ def test_results_come_by_name_and_a_dead_worker_costs_a_new_pool(
     prefect_server: None, tmp_path: Path
 ) -> None:
     # More than are under way at a time.
-    jobs = {str(n): {"value": n, "folder": str(tmp_path)} for n in range(20)}
-    assert _shards(_task(_die_once), jobs, workers=2) == {str(n): 2 * n for n in range(20)}
+    jobs = {str(n): {"value": n, "folder": str(tmp_path)} for n in range(10)}
+    assert _shards(_task(_die_once), jobs, workers=2) == {str(n): 2 * n for n in range(10)}
     assert (tmp_path / "3").exists()
 
 
@@ -237,9 +237,9 @@ def dataset(prefect_server: None, tmp_path_factory: pytest.TempPathFactory) -> P
 
     root = tmp_path_factory.mktemp("flows") / "dataset"
     made = generate(dataset=str(root), preset="smoke", overrides=FEW, max_workers=2)
-    assert made == {"dataset": str(root), "shards": 8, "written": 8}
+    assert made == {"dataset": str(root), "shards": 6, "written": 6}
     labelled = label(dataset=str(root), max_workers=2)
-    assert labelled["written"] == labelled["shards"] == 5 * 4 + 3
+    assert labelled["written"] == labelled["shards"] == 5 * 3
     assert labelled["holds"] > labelled["tasks"] / 2
     return root
 
@@ -261,14 +261,14 @@ def test_flows_make_the_same_bytes_as_the_plain_functions(dataset: Path, tmp_pat
     finish(tmp_path)
     plain = _bytes(tmp_path)
     assert {name: made for name, made in _bytes(dataset).items() if name in plain} == plain
-    assert len(plain) == 1 + 2 * 8 + 2 * (5 * 4 + 3)
+    assert len(plain) == 1 + 2 * 6 + 2 * (5 * 3)
 
 
 def test_flows_leave_artifacts_and_events(dataset: Path) -> None:
     artifacts = _artifacts()
     rows = json.loads(artifacts["generate-shards"]["data"])
-    assert sum(row["scenes"] for row in rows) == 16
-    assert sum(row["made now"] for row in rows) == 8
+    assert sum(row["scenes"] for row in rows) == 12
+    assert sum(row["made now"] for row in rows) == 6
     rows = json.loads(artifacts["label-shards"]["data"])
     assert {row["predicate"] for row in rows} == {
         "on",
@@ -290,7 +290,7 @@ def test_flows_leave_artifacts_and_events(dataset: Path) -> None:
         return {e["resource"]["relevance.table"]: e["payload"]["shards"] for e in found}
 
     _wait_for(lambda: len(ours()) == 2, 30, "two events")
-    assert ours() == {"scenes": 8, "labels": 23}
+    assert ours() == {"scenes": 6, "labels": 15}
 
 
 def test_a_second_run_makes_nothing_and_tells_nobody(
