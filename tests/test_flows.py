@@ -595,7 +595,7 @@ def test_deployments_schedule_and_trigger_on_a_real_server(tmp_path: Path) -> No
                 timeout=300,
             )
             assert "finished successfully" in out
-            assert len([*data.glob("scenes/*/*.parquet")]) == 8
+            assert len([*data.glob("scenes/*/*.parquet")]) == 6
             # Scenes alone do not train; labels do, and the full name works too.
             name = {"deployments": {"name": {"any_": ["retrain"]}}}
             runs = {"flow_runs": {"state": {"type": {"any_": ["SCHEDULED"]}}}}

@@ -250,7 +250,7 @@ OptionalFolder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")]
 
 def _bench(_: Preset) -> Callable[..., int]:
     def bench(
-        scenes: int = 160,
+        scenes: int = 320,
         rows: int = 50_000_000,
         shards: int = 100,
         kills: int = 24,
