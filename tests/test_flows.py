@@ -503,7 +503,7 @@ def test_a_flow_ends_with_its_server(home: Path) -> None:
         text=True,
     )
     with _ended(process):
-        _, errors = process.communicate(timeout=60)  # Prefect alone takes four minutes
+        _, errors = process.communicate(timeout=120)  # Prefect alone takes four minutes
         assert process.returncode == 1
         assert "the flow's Prefect server died; start the flow again" in errors
 
