@@ -21,7 +21,6 @@ from relevance.generation import (
     Counts,
     DatasetConfig,
     ShardSpec,
-    finish,
     generate_shard,
     label_shard,
     prepare,
@@ -71,23 +70,29 @@ def measure_making(
     that counts. Settings are those of the laptop preset. How much several processes do of plain
     arithmetic, which shares neither memory nor files, tells what this machine has to give.
     """
-    config = replace(
-        DatasetConfig.laptop(),
-        seed=seed,
+    nothing = {"validation": Counts(), "test": Counts()}
+    preset = replace(DatasetConfig.laptop(), seed=seed, **nothing)
+    whole = workers * preset.scenes_per_shard  # shards as the preset has them: each starts anew
+    drawn = replace(preset, train=Counts(same_plane=whole, on=whole))
+    planned = replace(
+        preset,
         train=Counts(same_plane=scenes, on=scenes),
-        validation=Counts(),
-        test=Counts(),
         scenes_per_shard=max(1, scenes // (8 * workers)),  # short, so that all end at once
     )
     rates: list[Rate] = []
+    stages: dict[str, tuple[Callable[[Any], tuple[int, float]], list[Any]]] = {}
     for processes in dict.fromkeys((1, workers)):
-        root = folder / f"made-by-{processes}"
-        with _pool(processes, folder / f"warm-{processes}", config) as pool:
-            specs = prepare(root, config)
-            stages: dict[str, tuple[Callable[[Any], tuple[int, float]], list[Any]]] = {
+        roots = [folder / f"{what}-by-{processes}" for what in ("drawn", "planned")]
+        with _pool(processes, folder / f"warm-{processes}", planned) as pool:
+            first, second = (
+                [(root, config, spec) for spec in prepare(root, config)]
+                for root, config in zip(roots, (drawn, planned), strict=True)
+            )
+            list(pool.map(_make, [(*job, None) for job in second]))
+            stages = {
                 "sums": (_add_up, [10_000_000] * 16),
-                "scenes": (_make, [(root, config, spec, None) for spec in specs]),
-                "goals": (_make, [(root, config, s, p.value) for s in specs for p in s.predicates]),
+                "scenes": (_make, [(*job, None) for job in first]),
+                "goals": (_make, [(*job, p.value) for job in second for p in job[2].predicates]),
             }
             for stage, (work, jobs) in stages.items():
                 start = time.perf_counter()
@@ -110,7 +115,6 @@ def measure_making(
                         seconds_cpu=cpu,
                     )
                 )
-        finish(root)
     if workers > 1:
         half = len(rates) // 2
         for stage, one, several in zip(stages, rates[:half], rates[half:], strict=True):

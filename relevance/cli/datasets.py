@@ -263,8 +263,8 @@ def _bench(_: Preset) -> Callable[..., int]:
         Writes tables and a CSV file for each part; the datasets themselves are not kept.
 
         Args:
-            scenes: Scenes of each family that are made and labelled, once by 1 process and once
-                by 2.
+            scenes: Scenes of each family whose goals are labelled, once by 1 process and once by 2;
+                scenes themselves are timed in shards of the laptop preset's size.
             rows: Synthetic label rows to query.
             shards: Files that they are in, for each predicate.
             kills: How often the making of a small dataset is disturbed.
