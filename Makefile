@@ -52,7 +52,7 @@ deploy: .venv/installed
 	rm -rf .venv
 	$(PYTHON) -m venv .venv || ( rm -rf .venv && $(PYTHON) -m venv --without-pip .venv \
 		&& $(PYTHON) -m pip --python .venv/bin/python install --quiet pip )
-	$(PIP) install --upgrade pip  # the one that Python 3.11 brings takes a minute longer here
+	$(PIP) install --upgrade pip  # the one that Python 3.11 brings is slower by a third
 
 .venv/installed: pyproject.toml | .venv/bin/python
 	$(PIP) install --no-compile -e .

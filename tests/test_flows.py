@@ -1,4 +1,4 @@
-"""The flows: their parameters, their pool, a killed run, a real server with a worker."""
+"""The flows: their pool, a killed run, a real server with a worker."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import json
 import os
-import re
 import signal
 import socket
 import sqlite3
@@ -20,8 +19,9 @@ from typing import Any
 
 import pytest
 
-from flows.parameters import ParameterError, configured, override
-from flows.plugin import FLOWS, full_name, wrap_read_deployment
+from flows.parameters import ParameterError, configured
+from flows.plugin import FLOWS
+from relevance.benchmarks.crashes import kill_all, members
 
 ROOT = Path(__file__).parent.parent
 BIN = Path(sys.executable).parent
@@ -36,78 +36,6 @@ FEW = {
     "goals_per_scene": 1,
 }
 """Overrides of the smoke preset: 6 shards of 2 scenes."""
-
-
-# --- parameters --------------------------------------------------------------------------
-
-
-def test_overrides_reach_nested_settings() -> None:
-    from relevance.generation import DatasetConfig
-
-    config = configured(DatasetConfig, "smoke", {"seed": 7, "train.on": 3, "train.same_plane": 5})
-    assert (config.seed, config.train.on, config.train.same_plane) == (7, 3, 5)
-    assert config.validation == DatasetConfig.smoke().validation
-    assert override(config, {}) == config
-    assert override(config, {"train": {"on": 4}}).train.same_plane == 5
-
-
-@pytest.mark.parametrize(
-    ("preset", "overrides", "culprit"),
-    [
-        ("smoke", {"sede": 1}, "sede: unknown setting"),
-        ("smoke", {"train.of": 1}, "train.of: unknown setting, expected one of on, same_plane"),
-        ("smoke", {"seed": "many"}, "seed: Input should be a valid integer"),
-        ("smoke", {"seed.low": 1}, "seed has no settings of its own"),
-        ("smoke", {"seed": -1}, "seed"),
-        ("huge", {}, "preset 'huge'"),
-        ("__init__", {}, "preset '__init__'"),
-    ],
-)
-def test_bad_parameters_are_named(preset: str, overrides: dict[str, Any], culprit: str) -> None:
-    from relevance.generation import DatasetConfig
-
-    with pytest.raises(ValueError, match=re.escape(culprit)):
-        configured(DatasetConfig, preset, overrides)
-
-
-def test_flows_refuse_bad_parameters_before_any_work(tmp_path: Path) -> None:
-    from prefect.exceptions import ParameterTypeError
-
-    from flows.generate import generate
-
-    (tmp_path / "file").write_text("")
-    for wrong in (
-        {"preset": "huge"},
-        {"max_workers": 0},
-        {"overrides": 3},
-        {"dataset": str(tmp_path / "file")},
-        {"dataset": " "},
-    ):
-        parameters = {"dataset": str(tmp_path / "new"), "preset": "smoke"} | wrong
-        with pytest.raises(ParameterTypeError, match=next(iter(wrong))):
-            generate.validate_parameters(parameters)
-    assert not (tmp_path / "new").exists()
-
-
-# --- the plugin --------------------------------------------------------------------------
-
-
-def test_short_names_are_only_ours() -> None:
-    assert [full_name(name) for name in FLOWS] == [f"{name}/{name}" for name in FLOWS]
-    assert full_name("generate/other") == "generate/other"
-    assert full_name("somebody") == "somebody"
-
-
-def test_a_client_is_wrapped_once() -> None:
-    class Client:
-        def read_deployment_by_name(self, name: str) -> str:
-            return name
-
-    wrap_read_deployment(Client)
-    once = Client.read_deployment_by_name
-    wrap_read_deployment(Client)
-    assert Client.read_deployment_by_name is once
-    assert Client().read_deployment_by_name("train") == "train/train"
 
 
 # --- the pool ----------------------------------------------------------------------------
@@ -427,32 +355,13 @@ def _generate(root: Path, home: Path) -> subprocess.Popen[bytes]:
     )
 
 
-def _session(leader: int) -> list[int]:
-    """The living processes of a session."""
-    found = []
-    for status in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = status.read_text().rpartition(")")[2].split()
-        except OSError:  # it ended while we looked
-            continue
-        if int(fields[3]) == leader and fields[0] != "Z":
-            found.append(int(status.parent.name))
-    return found
-
-
-def _kill_session(leader: int) -> None:
-    for process in _session(leader):
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(process, signal.SIGKILL)
-
-
 @contextmanager
 def _ended(process: subprocess.Popen[Any]) -> Iterator[subprocess.Popen[Any]]:
     """Whatever happens, nothing of the process's session is left."""
     try:
         yield process
     finally:
-        _kill_session(process.pid)
+        kill_all(process.pid)
         process.wait(30)
 
 
@@ -467,7 +376,7 @@ def test_a_killed_flow_leaves_nobody_behind_and_resumes_to_the_same_bytes(
         _wait_for(lambda: [*killed.glob("scenes/*/*.parquet")], 240, "a first shard")
         process.kill()
         process.wait(30)
-        _wait_for(lambda: not _session(process.pid), 60, "the end of its workers and server")
+        _wait_for(lambda: not members(process.pid), 60, "the end of its workers and server")
     before = {file: file.stat().st_mtime_ns for file in killed.glob("scenes/*/*.parquet")}
     assert 0 < len(before) < 20
 

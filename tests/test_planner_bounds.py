@@ -1,6 +1,9 @@
 """Kinematics against pybullet, gradients against finite differences, pose bound against a grid."""
 
 import math
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pybullet
@@ -365,3 +368,14 @@ def test_compiled_kernels_are_kept_by_the_content_of_all_their_sources(tmp_path)
     assert _kernel_cache(tmp_path) == before
     (tmp_path / "inner/b.py").write_text("@njit\ndef f(x): return 2 * x\n")
     assert _kernel_cache(tmp_path) != before
+
+
+def test_another_checkouts_kernels_are_not_inherited_but_the_users_folder_is(tmp_path):
+    script = "import os, relevance; print(os.environ['NUMBA_CACHE_DIR'])"
+    own = str(tmp_path / "relevance")
+    for folder, kept in ((f"{own}/kernels-of-before", False), (str(tmp_path / "mine"), True)):
+        env = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "NUMBA_CACHE_DIR": folder}
+        command = [sys.executable, "-c", script]
+        out = subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout
+        assert (out.strip() == folder) == kept
+        assert out.startswith(str(tmp_path))

@@ -495,6 +495,7 @@ def test_a_tar_that_is_not_ours() -> None:
         (good[:1000], "a.tar: s1.scene.json: expected 600 bytes, the tar ends before"),
         (good.replace(b"s1.scene.json", b"s1scenejson\0\0"), "a.tar: byte 0: expected the ustar"),
         (good.replace(b"ustar", b"gnu  "), "a.tar: byte 0: expected the ustar header"),
+        (good[:124] + b"00000000999" + good[135:], "a.tar: byte 0: expected the ustar header"),
     ):
         with pytest.raises(DatasetError, match=re.escape(message)):
             list(undecoded(broken, "a.tar"))

@@ -104,7 +104,7 @@ _TO_XYZ = np.array(  # IEC 61966-2-1
 def from_hsv(hue: float, saturation: float, value: float) -> Color:
     """RGB of a hue, saturation and value in 0..1, rounded to 0.001."""
     red, green, blue = (
-        round(1000 * value * (1 - saturation * max(min(k, 4 - k, 1), 0))) / 1000
+        round(1000 * (value * (1 - saturation * max(min(k, 4 - k, 1), 0)))) / 1000
         for k in ((offset + 6 * hue) % 6 for offset in (5.0, 3.0, 1.0))
     )
     return red, green, blue
