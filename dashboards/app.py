@@ -17,7 +17,7 @@ from typing import Any
 
 import streamlit as st
 
-from relevance.report.figures import read_evaluations, read_predictions, settings, summarise
+from relevance.evaluation.comparisons import read_evaluations, read_predictions, settings, summarise
 from relevance.report.gallery import outlined
 from relevance.report.plots import DASH, GROUPS, PAPER_ACCURACY, PREDICATES, seconds
 from relevance.store import SPLITS, Dataset, DatasetError, Sample

@@ -61,9 +61,9 @@ def evaluate_one(root: str, checkpoint: str, config: EvaluationConfig, shard: in
 @task(name="report", **_TASK)
 def report_one(root: str, checkpoint_id: str) -> str:
     """Write the report; its path."""
-    from relevance import report
+    from relevance.report import page
 
-    return str(report.build(root, checkpoint_id=checkpoint_id))
+    return str(page.build(root, checkpoint_id=checkpoint_id))
 
 
 @flow(

@@ -20,7 +20,7 @@ from flows.parameters import (
 from flows.shards import announce, process_pool, run_shards, worth_retrying
 
 if TYPE_CHECKING:
-    from relevance.generation import DatasetConfig, ShardReport, ShardSpec
+    from relevance.pipeline import DatasetConfig, ShardReport, ShardSpec
 
 
 @task(
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 )
 def generate_one(root: str, config: DatasetConfig, spec: ShardSpec) -> ShardReport:
     """Sample, render and write one shard."""
-    from relevance.generation import generate_shard
+    from relevance.pipeline import generate_shard
 
     return generate_shard(root, config, spec)
 
@@ -62,7 +62,7 @@ def generate(
         cluster: Address of a Dask scheduler whose workers make the shards instead, each of which
             reaches the dataset (and Prefect's server).
     """
-    from relevance.generation import DatasetConfig, finish, generated, prepare
+    from relevance.pipeline import DatasetConfig, finish, generated, prepare
     from relevance.store import Dataset
 
     root = absolute(dataset)

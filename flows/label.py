@@ -20,7 +20,7 @@ from flows.parameters import (
 from flows.shards import announce, process_pool, run_shards, worth_retrying
 
 if TYPE_CHECKING:
-    from relevance.generation import DatasetConfig, ShardReport, ShardSpec
+    from relevance.pipeline import DatasetConfig, ShardReport, ShardSpec
 
 
 @task(
@@ -35,7 +35,7 @@ def label_one(
     root: str, config: DatasetConfig, spec: ShardSpec, predicate: str, policy: str | None
 ) -> ShardReport:
     """Plan, replay and label the goals of one predicate in one shard."""
-    from relevance.generation import label_shard
+    from relevance.pipeline import label_shard
 
     return label_shard(root, config, spec, predicate, policy=policy)
 
@@ -65,8 +65,8 @@ def label(
         cluster: Address of a Dask scheduler whose workers make the shards instead, each of which
             reaches the dataset (and Prefect's server).
     """
-    from relevance.generation import finish, labelled, load_config, prepare
     from relevance.labels import POLICIES
+    from relevance.pipeline import finish, labelled, load_config, prepare
     from relevance.scene import Predicate
     from relevance.store import Dataset, sql
 

@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from relevance.hashing import content_hash
 from relevance.planner import PLANNER_VERSION, PlannerConfig, PlanResult, plan
-from relevance.scene import Scene, content_hash, scene_from_json, scene_to_json
+from relevance.scene import Scene, scene_from_json, scene_to_json
 from relevance.simulation import Rendering, Replay
 
 POLICIES = ("found", "necessary", "any-minimal")

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 from relevance.evaluation import EvaluationConfig, evaluate, predict
-from relevance.generation import (
+from relevance.pipeline import (
     Counts,
     DatasetConfig,
     generate_shard,

@@ -23,6 +23,7 @@ from relevance.benchmarks import (
 from relevance.benchmarks.against import measure_against
 from relevance.benchmarks.completeness import Compared, completeness_table
 from relevance.benchmarks.reference import CLEARANCE, _gap, shortest
+from relevance.benchmarks.runs import interval, ratio_of_medians, share
 from relevance.benchmarks.stability import (
     JITTER,
     JITTERS,
@@ -32,7 +33,6 @@ from relevance.benchmarks.stability import (
     jittered,
     stability_table,
 )
-from relevance.benchmarks.summary import interval, ratio_of_medians, share
 from relevance.cli import main
 from relevance.planner import Counts, PlannerConfig, PlanResult, Seconds, plan
 from relevance.scene import Box, Scene, footprint_gap, goal_holds, read_scenes

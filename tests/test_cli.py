@@ -73,7 +73,7 @@ def test_the_overview_is_quick_since_it_imports_nothing_heavy() -> None:
 
 
 def test_the_other_defaults_come_from_the_preset(capsys: pytest.CaptureFixture[str]) -> None:
-    from relevance.generation import DatasetConfig
+    from relevance.pipeline import DatasetConfig
 
     for preset in ("smoke", "laptop"):
         with pytest.raises(SystemExit):

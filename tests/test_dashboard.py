@@ -9,7 +9,7 @@ import pytest
 from evaluated import evaluated, labelled
 from streamlit.testing.v1 import AppTest
 
-from relevance.report.figures import read_evaluations, read_predictions, settings, summarise
+from relevance.evaluation.comparisons import read_evaluations, read_predictions, settings, summarise
 from relevance.store import Dataset
 
 APP = Path(__file__).parent.parent / "dashboards" / "app.py"

@@ -27,9 +27,7 @@ from relevance.evaluation import (
     load_scorer,
     predict,
 )
-from relevance.models import ModelConfig, RelevanceModel
-from relevance.planner import plan
-from relevance.report.figures import (
+from relevance.evaluation.comparisons import (
     Predictions,
     guided_cost,
     mean_interval,
@@ -39,6 +37,8 @@ from relevance.report.figures import (
     settings,
     summarise,
 )
+from relevance.models import ModelConfig, RelevanceModel
+from relevance.planner import plan
 from relevance.scene import Box, Goal, Scene
 from relevance.simulation import Renderer
 from relevance.store import Dataset

@@ -173,7 +173,7 @@ def dataset(prefect_server: None, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 def test_flows_make_the_same_bytes_as_the_plain_functions(dataset: Path, tmp_path: Path) -> None:
-    from relevance.generation import (
+    from relevance.pipeline import (
         DatasetConfig,
         finish,
         generate_shard,
@@ -243,7 +243,7 @@ def test_flows_refuse_what_is_not_there(prefect_server: None, tmp_path: Path) ->
     from flows.generate import generate
     from flows.label import label
     from flows.train import train
-    from relevance.generation import DatasetConfig, prepare
+    from relevance.pipeline import DatasetConfig, prepare
 
     for flow in (label, train):
         with pytest.raises(ValueError, match=r"no dataset\.json there"):
@@ -369,7 +369,7 @@ def test_a_killed_flow_leaves_nobody_behind_and_resumes_to_the_same_bytes(
     home: Path, tmp_path: Path
 ) -> None:
     from flows.generate import generate
-    from relevance.generation import DatasetConfig, finish, generate_shard, prepare
+    from relevance.pipeline import DatasetConfig, finish, generate_shard, prepare
 
     calm, killed = tmp_path / "calm", tmp_path / "killed"
     with _ended(_generate(killed, home)) as process:

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from relevance.pipeline.checking import check
 from relevance.planner import plan
-from relevance.statistics import check
 from relevance.store import Dataset
 
 GOLDEN = Path(__file__).parent.parent / "data" / "golden"

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from relevance.cli import main
-from relevance.generation import (
+from relevance.pipeline import (
     Counts,
     DatasetConfig,
     finish,
@@ -21,7 +21,7 @@ from relevance.generation import (
     label_shard,
     prepare,
 )
-from relevance.statistics import check
+from relevance.pipeline.checking import check
 from relevance.store import Dataset, DatasetError, locate, replacing, sql
 
 FEW = {

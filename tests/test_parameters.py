@@ -13,7 +13,7 @@ from flows.plugin import FLOWS, full_name, wrap_read_deployment
 
 
 def test_overrides_reach_nested_settings() -> None:
-    from relevance.generation import DatasetConfig
+    from relevance.pipeline import DatasetConfig
 
     config = configured(DatasetConfig, "smoke", {"seed": 7, "train.on": 3, "train.same_plane": 5})
     assert (config.seed, config.train.on, config.train.same_plane) == (7, 3, 5)
@@ -35,7 +35,7 @@ def test_overrides_reach_nested_settings() -> None:
     ],
 )
 def test_bad_parameters_are_named(preset: str, overrides: dict[str, Any], culprit: str) -> None:
-    from relevance.generation import DatasetConfig
+    from relevance.pipeline import DatasetConfig
 
     with pytest.raises(ValueError, match=re.escape(culprit)):
         configured(DatasetConfig, preset, overrides)

@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from evaluated import DATA, evaluated, labelled
 
-from relevance.generation import describe
-from relevance.report import build, figures, gallery, plots
+from relevance.evaluation import comparisons as figures
+from relevance.pipeline import describe
+from relevance.report import gallery, plots
 from relevance.report.gallery import KEPT, LOST, RELEVANT, outlined
+from relevance.report.page import build
 from relevance.store import Dataset, DatasetError
 from relevance.training import load_checkpoint
 

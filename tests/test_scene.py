@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from relevance.hashing import content_hash
 from relevance.scene import (
     GAP,
     Box,
@@ -22,7 +23,6 @@ from relevance.scene import (
     SceneError,
     Table,
     Texture,
-    content_hash,
     footprint_gap,
     goal_holds,
     read_scenes,

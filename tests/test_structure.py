@@ -11,17 +11,17 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 
 ORDER = (
+    "hashing",
+    "counters",
     "scene",
+    "store",
     "sampling",
     "simulation",
     "planner",
     "labels",
-    "store",
-    "generation",
-    "statistics",
     "models",
-    "examples",
     "training",
+    "pipeline",
     "evaluation",
     "report",
     "benchmarks",
@@ -40,8 +40,8 @@ DOORS = {
     "webdataset": ("store",),
     "upath": ("store",),
     "fsspec": ("store",),
-    "torch": ("models", "examples", "training", "evaluation"),
-    "matplotlib": ("statistics", "report", "benchmarks"),
+    "torch": ("models", "training", "evaluation"),
+    "matplotlib": ("report", "benchmarks"),
     "robotic": ("planner",),
     "jinja2": ("report",),
     "prefect": ("flows",),
@@ -115,10 +115,10 @@ def test_imports_point_one_way_and_libraries_have_one_door() -> None:
 
 def test_the_rules_see_what_they_should(tmp_path: Path) -> None:
     files = {
-        "relevance/__init__.py": "from relevance.report import build\n",
+        "relevance/__init__.py": "from relevance.report.page import build\n",
         "relevance/scene.py": "def f():\n    from relevance import store\n",
-        "relevance/labels.py": "import relevance.generation as g\nimport duckdb\n",
-        "relevance/store/tables.py": "from ..generation import work\nimport pyarrow.parquet\n",
+        "relevance/labels.py": "import relevance.pipeline as g\nimport duckdb\n",
+        "relevance/store/tables.py": "from ..pipeline import work\nimport pyarrow.parquet\n",
         "relevance/models.py": "import importlib\nimportlib.import_module('pybullet')\n",
         "relevance/helpers.py": "",
         "relevance/report/__init__.py": "from flows.generate import generate\n",
@@ -133,12 +133,12 @@ def test_the_rules_see_what_they_should(tmp_path: Path) -> None:
         "dashboards/app.py:2: matplotlib",
         "relevance/cli/__init__.py:2: torch",
         "relevance/helpers.py: no place in ORDER",
-        "relevance/labels.py:1: labels imports generation, which comes later",
+        "relevance/labels.py:1: labels imports pipeline, which comes later",
         "relevance/labels.py:2: duckdb",
         "relevance/models.py:2: pybullet",
         "relevance/report/__init__.py:1: report imports flows",
         "relevance/scene.py:2: scene imports store, which comes later",
-        "relevance/store/tables.py:1: store imports generation, which comes later",
+        "relevance/store/tables.py:1: store imports pipeline, which comes later",
     ]
 
 

@@ -19,9 +19,8 @@ import pytest
 import torch
 
 from relevance import training
-from relevance.examples import Examples, gather, in_the_mirror, load_examples, true_geometry
-from relevance.generation import Counts, DatasetConfig, generate_shard, prepare
 from relevance.models import ModelConfig, RelevanceModel, relevance_loss
+from relevance.pipeline import Counts, DatasetConfig, generate_shard, prepare
 from relevance.sampling import SceneConfig, sample_goals
 from relevance.scene import Camera, Predicate
 from relevance.store import Dataset, DatasetError
@@ -35,6 +34,13 @@ from relevance.training import (
     measure,
     polling,
     train,
+)
+from relevance.training.examples import (
+    Examples,
+    gather,
+    in_the_mirror,
+    load_examples,
+    true_geometry,
 )
 
 torch.set_num_threads(1)  # threads that wait for each other crawl on a busy machine

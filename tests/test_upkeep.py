@@ -16,11 +16,12 @@ from typing import Any
 import duckdb
 import numpy as np
 import pytest
-from test_generation import contents, untouched
+from test_pipeline import contents, untouched
 
-from relevance import generation, labels
+from relevance import labels, pipeline
 from relevance.cli import main
-from relevance.generation import (
+from relevance.labels import POLICIES, label_rows, necessary, stored_scene
+from relevance.pipeline import (
     Counts,
     DatasetConfig,
     actual,
@@ -38,11 +39,10 @@ from relevance.generation import (
     settings,
     shards_of,
 )
-from relevance.generation.estimating import Estimate
-from relevance.labels import POLICIES, label_rows, necessary, stored_scene
+from relevance.pipeline.checking import check
+from relevance.pipeline.estimating import Estimate
 from relevance.planner import PlannerConfig, plan
 from relevance.sampling import SceneConfig
-from relevance.statistics import check
 from relevance.store import SCHEMAS, Dataset, DatasetError, compact, export, sql
 
 CONFIG = DatasetConfig(
@@ -544,8 +544,8 @@ def test_finished_labels_need_no_worker(made: Path, monkeypatch: pytest.MonkeyPa
     def no_work(*_: Any, **__: Any) -> None:
         raise AssertionError("nothing is left to do")
 
-    monkeypatch.setattr(generation.shards, "_compile", no_work)
-    monkeypatch.setattr(generation.shards, "plan", no_work)
+    monkeypatch.setattr(pipeline.shards, "_compile", no_work)
+    monkeypatch.setattr(pipeline.shards, "plan", no_work)
     dataset = Dataset.open(made)
     for spec in prepare(made, CONFIG):
         assert all(labelled(dataset, CONFIG, spec, p) for p in spec.predicates)

@@ -7,11 +7,11 @@ unless a name says wall; intervals are 95%: bootstrap for times, Wilson for shar
 
 from relevance.benchmarks.against import measure_against
 from relevance.benchmarks.completeness import measure_completeness
-from relevance.benchmarks.planned import measure_planning
 from relevance.benchmarks.plots import save
+from relevance.benchmarks.runs import Measured
 from relevance.benchmarks.searches import MAX_EDGE, SIZES, measure_scaling, measure_searches
+from relevance.benchmarks.speed import measure_planning
 from relevance.benchmarks.stability import measure_stability
-from relevance.benchmarks.summary import Measured
 from relevance.benchmarks.tasks import BenchmarkError, Task, draw
 
 __all__ = [

@@ -9,8 +9,7 @@ from functools import partial
 import numpy as np
 
 from relevance.benchmarks import plots
-from relevance.benchmarks.planned import DEFAULTS, planned, replayed
-from relevance.benchmarks.summary import (
+from relevance.benchmarks.runs import (
     TIMES,
     Measured,
     Plot,
@@ -19,11 +18,12 @@ from relevance.benchmarks.summary import (
     ratio_of_medians,
     share,
 )
+from relevance.benchmarks.speed import DEFAULTS, planned, replayed
 from relevance.benchmarks.tasks import Task
 from relevance.planner import PlannerConfig, PlanResult, warm_up
+from relevance.report.tables import Table
 from relevance.scene import Goal, Scene
 from relevance.simulation import replay
-from relevance.statistics import Table
 
 Peer = Callable[[Scene, Goal], PlanResult]
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from relevance.benchmarks.planned import DEFAULTS, timed_plan
 from relevance.benchmarks.reference import CLEARANCE, shortest
-from relevance.benchmarks.summary import Measured, Progress, share
+from relevance.benchmarks.runs import Measured, Progress, share
+from relevance.benchmarks.speed import DEFAULTS, timed_plan
 from relevance.benchmarks.tasks import Task
 from relevance.planner import PlannerConfig, warm_up
-from relevance.statistics import Table
+from relevance.report.tables import Table
 
 BOXES = (3, 5)
 ROBUST = 0.005

@@ -20,7 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from relevance.generation import (
+from relevance.pipeline import (
     DatasetConfig,
     finish,
     generate_shard,
@@ -28,7 +28,7 @@ from relevance.generation import (
     prepare,
     repair,
 )
-from relevance.statistics import check
+from relevance.pipeline.checking import check
 
 CLOCKS = ("timings", "durations")
 """Tables outside the promise of equal bytes."""

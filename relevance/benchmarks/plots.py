@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from relevance.report.plots import MUTED, STYLE
 
 if TYPE_CHECKING:
-    from relevance.benchmarks.planned import Planned
-    from relevance.benchmarks.summary import Plot
+    from relevance.benchmarks.runs import Plot
+    from relevance.benchmarks.speed import Planned
 
 BLUE, ORANGE, GREEN, GREY = "#2f6db3", "#c26a1c", "#3a8a5f", "#8a939d"
 BOUND_COLOR = {"pose": GREEN, "keyframe": ORANGE, "path": BLUE, "rest": GREY}

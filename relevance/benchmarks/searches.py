@@ -9,11 +9,11 @@ from functools import partial
 import numpy as np
 
 from relevance.benchmarks import plots
-from relevance.benchmarks.planned import DEFAULTS, Planned, planned
-from relevance.benchmarks.summary import Measured, Plot, Progress, interval, share
+from relevance.benchmarks.runs import Measured, Plot, Progress, interval, share
+from relevance.benchmarks.speed import DEFAULTS, Planned, planned
 from relevance.benchmarks.tasks import Task
 from relevance.planner import PlannerConfig, warm_up
-from relevance.statistics import Table
+from relevance.report.tables import Table
 
 SEARCHES = ("informed", "tree")
 SIZES = (3, 5, 10, 15, 20, 30)

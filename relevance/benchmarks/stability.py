@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from relevance.benchmarks.planned import DEFAULTS
-from relevance.benchmarks.summary import Measured, Progress, share
+from relevance.benchmarks.runs import Measured, Progress, share
+from relevance.benchmarks.speed import DEFAULTS
 from relevance.benchmarks.tasks import BenchmarkError, Task
 from relevance.planner import PlannerConfig, PlanResult, plan, warm_up
+from relevance.report.tables import Table
 from relevance.scene import Scene, SceneError
-from relevance.statistics import Table
 
 JITTER = 1e-4
 """How far each box is moved, m, in a direction of its own."""

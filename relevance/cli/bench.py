@@ -59,7 +59,7 @@ def bench_planner(_: Any) -> Callable[..., int]:
             raise UsageError(f"--seed {seed}: expected 0 to 2**63 - 1")
         seed = secrets.randbits(32) if seed is None else seed
         if against:
-            from relevance.planner.peer import require_rai
+            from relevance.planner.rai.planner import require_rai
 
             require_rai()
         chosen = parts if parts is not None else () if against else PARTS
@@ -90,7 +90,7 @@ def _work(
     drawn = draw(tasks, seed)
     _write_scenes(folder / "scenes.jsonl", drawn)
     if against:
-        from relevance.planner.peer import RaiConfig, plan_rai
+        from relevance.planner.rai.planner import RaiConfig, plan_rai
 
         config = RaiConfig(seconds=limit)
         yield (

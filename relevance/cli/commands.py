@@ -25,7 +25,7 @@ OptionalCount = Annotated[int | None, tyro.conf.arg(metavar="N")]
 
 
 def _generate(preset: Preset) -> Callable[..., int]:
-    from relevance.generation import DatasetConfig, finish, generate_shard, generated, prepare
+    from relevance.pipeline import DatasetConfig, finish, generate_shard, generated, prepare
     from relevance.store import Dataset
 
     start: DatasetConfig = getattr(DatasetConfig, preset)()
@@ -56,8 +56,8 @@ def _generate(preset: Preset) -> Callable[..., int]:
 
 
 def _label(_: Preset) -> Callable[..., int]:
-    from relevance.generation import finish, label_shard, labelled, load_config, prepare
     from relevance.labels import POLICIES
+    from relevance.pipeline import finish, label_shard, labelled, load_config, prepare
     from relevance.scene import Predicate
     from relevance.store import Dataset, sql
 
@@ -176,10 +176,10 @@ def _report(_: Preset) -> Callable[..., int]:
             dataset: Folder of the dataset.
             out: Where to; DATASET/report.html when not given.
         """
-        from relevance import report
+        from relevance.report import page
 
         with console.status("report"):
-            path = report.build(dataset, out)
+            path = page.build(dataset, out)
         print(path)
         return 0
 
@@ -239,7 +239,7 @@ def _plan(_: Preset) -> Callable[..., int]:
         if not tasks:
             raise SceneError(f"{scenes}: no goals, expected some in the file or by --goal")
         if planner == "rai":
-            from relevance.planner.peer import RaiConfig, plan_rai
+            from relevance.planner.rai.planner import RaiConfig, plan_rai
 
             solve = functools.partial(plan_rai, config=RaiConfig(seconds=seconds))
         else:
@@ -273,7 +273,7 @@ def _check(_: Preset) -> Callable[..., int]:
             dataset: Folder of the dataset.
             render: Also render one scene of each shard again and compare the pixels.
         """
-        from relevance.statistics import check
+        from relevance.pipeline.checking import check
 
         with bar("files") as progress:
             breaches = check(dataset, render=render, progress=progress)
@@ -323,7 +323,8 @@ def _stats(_: Preset) -> Callable[..., int]:
             format: How to print the tables.
             card: Folder to write a dataset card to instead: a page of Markdown and its pictures.
         """
-        from relevance.statistics import statistics, write_card
+        from relevance.report.card import write_card
+        from relevance.report.tables import statistics
 
         if card is not None:
             print(write_card(dataset, card))

@@ -17,8 +17,8 @@ from relevance.cli.terminal import Format, UsageError, bar, say, show
 
 
 def _estimate(preset: Preset) -> Callable[..., int]:
-    from relevance.generation import DatasetConfig, actual, estimate, load_config
-    from relevance.generation.estimating import Estimate, Job
+    from relevance.pipeline import DatasetConfig, actual, estimate, load_config
+    from relevance.pipeline.estimating import Estimate, Job
     from relevance.store import Dataset, locate
 
     start: DatasetConfig = getattr(DatasetConfig, preset)()
@@ -107,7 +107,7 @@ def _append(_: Preset) -> Callable[..., int]:
             same_plane: How many scenes for the same-plane predicates.
             on: How many scenes for `on`.
         """
-        from relevance.generation import append
+        from relevance.pipeline import append
 
         specs = append(dataset, split, same_plane=same_plane, on=on)
         say(f"{dataset}: {len(specs)} shards now")
@@ -129,7 +129,7 @@ def _merge(_: Preset) -> Callable[..., int]:
             datasets: The datasets; equal schemas, no scene in common.
             into: Folder of the new one.
         """
-        from relevance.generation import merge, shards_of
+        from relevance.pipeline import merge, shards_of
 
         merged = merge(datasets, into)
         say(f"{into}: {len(shards_of(merged))} shards of {len(merged.sources)} datasets")
@@ -149,9 +149,9 @@ def _repair(_: Preset) -> Callable[..., int]:
             dataset: Folder of the dataset.
             workers: Processes that work at a time.
         """
-        from relevance import generation
+        from relevance import pipeline
+        from relevance.pipeline.checking import check
         from relevance.scene import Predicate
-        from relevance.statistics import check
         from relevance.store import Dataset
 
         with bar("files checked") as progress:
@@ -166,15 +166,15 @@ def _repair(_: Preset) -> Callable[..., int]:
             or predicate.value in there.description.get("finished", ())
         ]
         policies = sorted({of.policy for of in there.labellings()})
-        generation.repair(dataset, named)
-        config = generation.load_config(there)
-        specs = generation.prepare(dataset, config)
-        missing = [spec for spec in specs if not generation.generated(there, spec)]
-        jobs: list[Any] = [(generation.generate_shard, (dataset, config, s)) for s in missing]
+        pipeline.repair(dataset, named)
+        config = pipeline.load_config(there)
+        specs = pipeline.prepare(dataset, config)
+        missing = [spec for spec in specs if not pipeline.generated(there, spec)]
+        jobs: list[Any] = [(pipeline.generate_shard, (dataset, config, s)) for s in missing]
         make_shards(dataset, jobs, [spec.count for spec in missing], workers)
         for policy in (None, *policies):
             make_shards(dataset, *_labelling(dataset, config, specs, predicates, policy), workers)
-        generation.finish(dataset)
+        pipeline.finish(dataset)
         with bar("files checked") as progress:
             left = check(dataset, progress=progress)
         for breach in left:
@@ -188,7 +188,7 @@ def _repair(_: Preset) -> Callable[..., int]:
 def _labelling(
     dataset: Path, config: Any, specs: Any, predicates: Any, policy: str | None
 ) -> tuple[list[Any], list[int]]:
-    from relevance.generation import label_shard, labelled
+    from relevance.pipeline import label_shard, labelled
     from relevance.store import Dataset
 
     there = Dataset.open(dataset)
@@ -278,28 +278,28 @@ def _bench(_: Preset) -> Callable[..., int]:
         folder = out or Path("data/bench") / f"dataset-{seed}"
         folder.mkdir(parents=True, exist_ok=True)
         say(f"seed {seed}, pid {os.getpid()}, to {folder}")
-        from relevance.benchmarks import dataset
+        from relevance.benchmarks import datasets
         from relevance.cli.bench import hand_over
 
         with tempfile.TemporaryDirectory(prefix="relevance-bench-") as scratch:
             place = Path(scratch)
             if "making" in parts:
                 with bar("units of work") as progress:
-                    made = dataset.measure_making(
+                    made = datasets.measure_making(
                         place, scenes=scenes, seed=seed, progress=progress
                     )
                 hand_over(made, folder)
             if "reading" in parts:
-                hand_over(dataset.measure_reading(place, seed=seed), folder)
+                hand_over(datasets.measure_reading(place, seed=seed), folder)
             if "queries" in parts:
                 with bar("files") as progress:
-                    asked = dataset.measure_queries(
+                    asked = datasets.measure_queries(
                         place, rows=rows, shards=shards, progress=progress
                     )
                 hand_over(asked, folder)
             if "crashes" in parts:
                 with bar("disturbances") as progress:
-                    survived = dataset.measure_crashes(
+                    survived = datasets.measure_crashes(
                         place, kills=kills, seed=seed, progress=progress
                     )
                 hand_over(survived, folder)

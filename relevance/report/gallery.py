@@ -11,7 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from relevance.scene import Predicate, content_hash
+from relevance.hashing import content_hash
+from relevance.scene import Predicate
 from relevance.store import Dataset, Sample
 
 Rows = Callable[..., list[dict[str, Any]]]

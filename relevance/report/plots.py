@@ -21,7 +21,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from relevance.report.figures import Comparison, Predictions, guided_cost, mean_interval
+from relevance.evaluation.comparisons import Comparison, Predictions, guided_cost, mean_interval
 from relevance.scene import Predicate
 
 PAPER_ACCURACY = {"same-plane": (0.90, 0.95, 0.94), "on": (0.76, 0.89, 0.87)}

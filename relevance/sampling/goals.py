@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relevance.sampling.counters import generator
+from relevance.counters import generator
 from relevance.sampling.fitting import GRASPABLE_EDGE
 from relevance.scene import Goal, Predicate, Scene, goal_holds
 

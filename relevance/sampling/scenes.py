@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from relevance.counters import generator
+from relevance.hashing import content_hash
 from relevance.sampling.colors import MOST, Color, draw_colors
-from relevance.sampling.counters import generator
 from relevance.sampling.fitting import GRASPABLE_EDGE, Standing
 from relevance.sampling.randomisation import (
     Randomisation,
@@ -17,17 +18,7 @@ from relevance.sampling.randomisation import (
     draw_table,
 )
 from relevance.sampling.rows import row
-from relevance.scene import (
-    FAMILIES,
-    GAP,
-    Box,
-    Camera,
-    Light,
-    Robot,
-    Scene,
-    Table,
-    content_hash,
-)
+from relevance.scene import FAMILIES, GAP, Box, Camera, Light, Robot, Scene, Table
 
 NEAR = 0.026
 """Narrowest gap of a crowded box to its neighbour, m. A finger beside a box takes 34 mm with its

@@ -27,7 +27,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from relevance.scene import content_hash
+from relevance.hashing import content_hash
 from relevance.store import queries
 from relevance.store.images import Pictures, Sample, decode, encode, undecoded
 from relevance.store.places import file_hash, is_remote, locate, replacing, sweep

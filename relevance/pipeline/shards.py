@@ -19,13 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from relevance.generation.settings import (
-    DatasetConfig,
-    ShardReport,
-    ShardSpec,
-    refuse_merged,
-    settings_of_family,
-)
+from relevance.hashing import content_hash
 from relevance.labels import (
     POLICIES,
     Verdict,
@@ -36,9 +30,16 @@ from relevance.labels import (
     stored_scene,
     timing_row,
 )
+from relevance.pipeline.settings import (
+    DatasetConfig,
+    ShardReport,
+    ShardSpec,
+    refuse_merged,
+    settings_of_family,
+)
 from relevance.planner import plan, warm_up
 from relevance.sampling import SceneConfig, sample_goals, sample_scene
-from relevance.scene import Predicate, Scene, content_hash, scene_to_json
+from relevance.scene import Predicate, Scene, scene_to_json
 from relevance.simulation import Renderer, Rendering, rejects, replay
 from relevance.store import Dataset, DatasetError, Labelling, copy_file
 

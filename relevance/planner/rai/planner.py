@@ -2,7 +2,7 @@
 
 The scene and the goal become rai's files: a configuration (rai's Panda with the same joints,
 at the scene's robot base, so that its seven angles are ours), the rules of pick and place, and
-the goal region as a place of its own. `rai_solver.py` runs in a subprocess with a limit, since
+the goal region as a place of its own. `solver.py` runs in a subprocess with a limit, since
 rai's search never returns where there is no plan; what it prints tells when it has run out of
 action sequences.
 
@@ -62,7 +62,7 @@ REGION_MARGIN = 0.002
 EXHAUSTED = "queue is empty"
 """What rai prints, for ever, once there is no further action sequence."""
 NO_SEQUENCE = "NO SEQUENCE"
-"""What rai_solver prints when the rules allow no action sequence at all."""
+"""What solver prints when the rules allow no action sequence at all."""
 _FRAMES = dict(zip(LINKS, ("l_panda_joint5", "l_panda_joint6", "l_panda_hand_joint"), strict=True))
 _FINGERS = {1.0: "l_panda_finger_joint1", -1.0: "l_panda_finger_joint2"}
 _FINGER_ROOT = 0.0584  # of both finger frames, along the hand's z, m
@@ -236,7 +236,7 @@ def _run(
         (folder / "task.json").write_text(json.dumps(task))
         before = _children()
         process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("rai_solver.py"))],
+            [sys.executable, str(Path(__file__).with_name("solver.py"))],
             cwd=folder, env={**os.environ, "OMP_NUM_THREADS": "1"}, text=True, errors="replace",
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         )  # fmt: skip

@@ -12,10 +12,11 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from relevance.hashing import content_hash
 from relevance.labels import POLICIES
 from relevance.planner import PLANNER_VERSION, PlannerConfig
 from relevance.sampling import GoalConfig, SceneConfig
-from relevance.scene import FAMILIES, Predicate, content_hash
+from relevance.scene import FAMILIES, Predicate
 from relevance.store import (
     SPLITS,
     TABLES,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest, bootstrap
 
-from relevance.statistics import Table
+from relevance.report.tables import Table
 
 CONFIDENCE = 0.95
 RESAMPLES = 2000

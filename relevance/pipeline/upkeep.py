@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from relevance.generation.settings import ShardSpec, shards_of
-from relevance.generation.shards import generated
+from relevance.pipeline.settings import ShardSpec, shards_of
+from relevance.pipeline.shards import generated
 from relevance.scene import Predicate
 from relevance.store import Dataset, DatasetError
 

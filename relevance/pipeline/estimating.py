@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from relevance.generation.settings import (
+from relevance.pipeline.settings import (
     Counts,
     DatasetConfig,
     ShardReport,
@@ -22,7 +22,7 @@ from relevance.generation.settings import (
     prepare,
     work,
 )
-from relevance.generation.shards import generate_shard, label_shard
+from relevance.pipeline.shards import generate_shard, label_shard
 from relevance.scene import FAMILIES
 from relevance.store import SPLITS, Dataset, empty_size, locate, replacing, sql
 

@@ -11,11 +11,13 @@ from pathlib import Path
 import cv2
 import pyarrow.parquet as pq
 import pytest
-from test_generation import CONFIG, small_dataset
+from test_pipeline import CONFIG, small_dataset
 
-from relevance.generation import prepare
+from relevance.pipeline import prepare
+from relevance.pipeline.checking import Breach, check, rules
+from relevance.report.card import write_card
+from relevance.report.tables import statistics
 from relevance.scene import Predicate, scene_to_json
-from relevance.statistics import Breach, check, rules, statistics, write_card
 from relevance.store import Dataset, DatasetError, sql
 
 SCENES = {"split": "train", "shard": 0}

@@ -34,7 +34,7 @@ from scipy.stats import rankdata
 from torch import Tensor
 from torch.nn import functional as F
 
-from relevance.examples import Batch, Examples, gather, in_the_mirror, load_examples
+from relevance.hashing import content_hash
 from relevance.models import (
     GEOMETRY,
     ModelConfig,
@@ -42,8 +42,9 @@ from relevance.models import (
     relevance_loss,
     vit_paper,
 )
-from relevance.scene import Predicate, content_hash
+from relevance.scene import Predicate
 from relevance.store import Dataset, DatasetError, replacing
+from relevance.training.examples import Batch, Examples, gather, in_the_mirror, load_examples
 
 CHECKPOINT_VERSION = 1
 """Schema version of checkpoint files; a file of another version is refused."""

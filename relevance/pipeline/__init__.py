@@ -1,8 +1,8 @@
 """Making a dataset: its settings and shards, how they are made, kept, merged and estimated."""
 
-from relevance.generation.estimating import Estimate, Quantities, actual, estimate
-from relevance.generation.merging import merge
-from relevance.generation.settings import (
+from relevance.pipeline.estimating import Estimate, Quantities, actual, estimate
+from relevance.pipeline.merging import merge
+from relevance.pipeline.settings import (
     LAYOUT,
     Counts,
     DatasetConfig,
@@ -15,7 +15,7 @@ from relevance.generation.settings import (
     shards_of,
     work,
 )
-from relevance.generation.shards import (
+from relevance.pipeline.shards import (
     ATTEMPTS,
     draw,
     generate_shard,
@@ -23,7 +23,7 @@ from relevance.generation.shards import (
     label_shard,
     labelled,
 )
-from relevance.generation.upkeep import finish, integrity, repair
+from relevance.pipeline.upkeep import finish, integrity, repair
 
 __all__ = [
     "ATTEMPTS",

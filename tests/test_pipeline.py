@@ -21,7 +21,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relevance.generation import (
+from relevance.labels import stored_scene
+from relevance.pipeline import (
     Counts,
     DatasetConfig,
     ShardSpec,
@@ -32,7 +33,6 @@ from relevance.generation import (
     shards,
     work,
 )
-from relevance.labels import stored_scene
 from relevance.sampling import SceneConfig, sample_goals, sample_scene
 from relevance.scene import FAMILIES, Predicate
 from relevance.store import SPLITS, Dataset, DatasetError
@@ -324,7 +324,7 @@ def test_a_lost_shard_is_made_again(made: Path) -> None:
 def test_a_killed_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:
     program = (
         "import sys, time\nfrom pathlib import Path\nsys.path.insert(0, sys.argv[2])\n"
-        "from test_generation import CONFIG, prepare, generate_shard\n"
+        "from test_pipeline import CONFIG, prepare, generate_shard\n"
         "root = Path(sys.argv[1])\n"
         "def wait(done, of):\n"
         "    print('half made', flush=True)\n"

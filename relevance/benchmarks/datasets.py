@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from relevance.benchmarks.crashes import Trial, disturb
-from relevance.benchmarks.summary import Measured, Progress
-from relevance.generation import (
+from relevance.benchmarks.runs import Measured, Progress
+from relevance.pipeline import (
     Counts,
     DatasetConfig,
     ShardSpec,
@@ -25,7 +25,7 @@ from relevance.generation import (
     label_shard,
     prepare,
 )
-from relevance.statistics import Table
+from relevance.report.tables import Table
 from relevance.store import Dataset, compact, decode, sql, synthetic_labels, undecoded
 
 SCENES_A_SECOND = 60.0

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from relevance.generation import ShardSpec, integrity, load_config, shards_of
 from relevance.labels import stored_scene
+from relevance.pipeline import ShardSpec, integrity, load_config, shards_of
 from relevance.scene import (
     Pose,
     Scene,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from relevance.generation import shards_of
+from relevance.pipeline import shards_of
 from relevance.store import Dataset
 
 

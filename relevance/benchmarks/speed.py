@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from relevance.benchmarks import plots
-from relevance.benchmarks.summary import (
+from relevance.benchmarks.runs import (
     TIMES,
     Measured,
     Plot,
@@ -21,9 +21,9 @@ from relevance.benchmarks.summary import (
 )
 from relevance.benchmarks.tasks import Task
 from relevance.planner import PlannerConfig, PlanResult, penetration, plan, warm_up
+from relevance.report.tables import Table
 from relevance.scene import Scene
 from relevance.simulation import MAX_PENETRATION, replay
-from relevance.statistics import Table
 
 DEFAULTS = PlannerConfig()
 """What is measured unless said otherwise."""

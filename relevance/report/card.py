@@ -18,8 +18,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from relevance.report.tables import Statistics, Table, cell, statistics
 from relevance.scene import Predicate
-from relevance.statistics.tables import Statistics, Table, cell, statistics
 from relevance.store import Dataset
 
 PAGE = "README.md"

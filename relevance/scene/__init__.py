@@ -8,18 +8,19 @@ NaN, overlapping, floating and off-table boxes are refused with the field's name
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
+
+from relevance.hashing import content_hash
 
 GAP = 0.05
 """Depth of a same-plane goal region, m (DESIGN section 2)."""
@@ -412,16 +413,6 @@ def _check_boxes(objects: tuple[Box, ...], table: Table) -> None:
                     f"{where}: overlaps {other.name!r} by {1000 * depth:.1f} mm, "
                     "expected boxes apart or touching"
                 )
-
-
-def content_hash(value: Any) -> str:
-    """16 hex digits that depend on the JSON form of `value` alone."""
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"), default=_jsonable)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _jsonable(value: Any) -> Any:
-    return TypeAdapter(type(value)).dump_python(value, mode="json")
 
 
 _SCENE = TypeAdapter(Scene)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from relevance.generation.settings import (
+from relevance.pipeline.settings import (
     Counts,
     ShardSpec,
     describe,

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from relevance.hashing import content_hash
 from relevance.planner import (
     GUIDES,
     PLANNER_VERSION,
@@ -34,7 +35,7 @@ from relevance.planner import (
     plan,
 )
 from relevance.planner.search import Mode
-from relevance.scene import Goal, Predicate, Scene, content_hash
+from relevance.scene import Goal, Predicate, Scene
 from relevance.store import SPLITS, Dataset
 
 if TYPE_CHECKING:  # models imports torch, which the planner and the report do without
