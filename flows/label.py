@@ -67,10 +67,10 @@ def label(
     """
     from relevance.labels import POLICIES
     from relevance.pipeline import finish, labelled, load_config, prepare
-    from relevance.scene import Predicate
+    from relevance.scene import PREDICATES
     from relevance.store import Dataset, sql
 
-    known = [predicate.value for predicate in Predicate]
+    known = list(PREDICATES)
     for name in predicates or ():
         if name not in known:
             raise ParameterError(f"predicates: unknown {name!r}, expected {', '.join(known)}")
@@ -81,17 +81,17 @@ def label(
     config = override(load_config(there), overrides or {})
     specs = prepare(root, config, replan=replan or bool(overrides))
     jobs = {
-        f"{predicate.value}-{spec.split}-{spec.shard:06d}": {
+        f"{predicate.name}-{spec.split}-{spec.shard:06d}": {
             "root": str(root),
             "config": config,
             "spec": spec,
-            "predicate": predicate.value,
+            "predicate": predicate.name,
             "policy": policy,
         }
         for spec in specs
         if there.has("scenes", split=spec.split, shard=spec.shard)
         for predicate in spec.predicates
-        if predicate.value in (predicates or known)
+        if predicate.name in (predicates or known)
     }
     if not jobs:
         raise ParameterError(f"{root}: no scenes of these predicates, expected `generate` first")

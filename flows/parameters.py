@@ -16,6 +16,8 @@ from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
+from relevance.errors import RelevanceError
+
 Preset = Literal["smoke", "demo", "laptop", "paper"]
 Overrides = dict[str, Any]
 
@@ -41,7 +43,7 @@ Cluster = Annotated[str, AfterValidator(_cluster)]
 C = TypeVar("C")
 
 
-class ParameterError(ValueError):
+class ParameterError(RelevanceError):
     """A preset or setting that is not known or not allowed; says which and what is expected."""
 
 

@@ -129,7 +129,7 @@ def plan_row(
         "scene_id": scene.id,
         "split": split,
         "shard": shard,
-        "predicate": result.goal.predicate.value,
+        "predicate": result.goal.predicate.name,
         "subject": result.goal.subject,
         "reference": result.goal.reference,
         "status": result.status,

@@ -66,7 +66,7 @@ def test_tasks_depend_on_the_seed_alone_and_a_longer_draw_keeps_the_earlier(task
 def test_predicates_and_sizes_come_in_equal_shares_and_no_goal_is_true_yet(tasks):
     assert set(Counter(task.goal.predicate for task in tasks).values()) == {8}
     assert Counter(task.n_objects for task in tasks) == dict.fromkeys(range(3, 11), 5)
-    assert not any(goal_holds(task.scene.objects, task.goal) for task in tasks)
+    assert not any(goal_holds(task.scene.objects, task.goal, task.scene.robot) for task in tasks)
 
 
 def test_thirty_boxes_can_be_drawn():

@@ -25,7 +25,7 @@ from relevance.models import (
     vit_small,
 )
 from relevance.sampling import project
-from relevance.scene import Box, Camera, Predicate
+from relevance.scene import PREDICATES, Box, Camera, Predicate, Robot
 
 torch.set_num_threads(1)  # threads that wait for each other crawl on a busy machine
 
@@ -63,7 +63,7 @@ def test_vit_shared_encoding_equals_one_encoding_a_query() -> None:
     vit = model("vit")
     image, views = pictures()
     encoding = vit.encode(image, views)
-    for predicate in Predicate:
+    for predicate in PREDICATES.values():
         shared = vit.decode(encoding, predicate, GOALS)
         for b in range(2):
             for g in range(3):
@@ -79,7 +79,7 @@ def test_glimpse_shared_encoding_equals_one_encoding_a_goal() -> None:
     glimpse = model("glimpse")
     image, views = pictures()
     encoding = glimpse.encode(image, views)
-    for predicate in Predicate:
+    for predicate in PREDICATES.values():
         shared = glimpse.decode(encoding, predicate, GOALS)
         for b in range(2):
             for g in range(3):
@@ -129,14 +129,14 @@ def test_vit_tokens_do_not_see_other_objects() -> None:
 def test_every_predicate_has_a_head_of_its_own(body: str) -> None:
     network = model(body)
     encoding = network.encode(*pictures())
-    network.decode(encoding, Predicate.BEHIND, GOALS).sum().backward()
+    network.decode(encoding, PREDICATES["behind"], GOALS).sum().backward()
     heads = network.body.heads if body == "glimpse" else network.body.extractors
     assert isinstance(heads, torch.nn.ModuleDict)
     moved = {
         name for name, head in heads.items() if any(w.grad is not None for w in head.parameters())
     }
     assert moved == {"behind"}
-    assert set(heads) == {predicate.value for predicate in Predicate}
+    assert set(heads) == {predicate.name for predicate in PREDICATES.values()}
 
 
 @BODIES
@@ -156,7 +156,7 @@ def test_arrays_of_one_scene_score_as_tensors_do(body: str) -> None:
     encoding = network.encode_scene(
         image[0].permute(1, 2, 0).numpy(), views[0].permute(0, 2, 3, 1).numpy()
     )
-    goals = [(Predicate.ON, 0, 1), (Predicate.BEHIND, 3, 2), (Predicate.ON, 4, 0)]
+    goals = [(PREDICATES["on"], 0, 1), (PREDICATES["behind"], 3, 2), (PREDICATES["on"], 4, 0)]
     scores = network.score_goals(encoding, goals)
     assert scores.shape == (3, 5)
     for row, (predicate, subject, reference) in zip(scores, goals, strict=True):
@@ -256,19 +256,19 @@ def test_mirror_is_the_geometry_of_the_mirrored_boxes() -> None:
     torch.testing.assert_close(mirrored(mirrored(plain)), plain)
 
 
-@pytest.mark.parametrize("predicate", [p for p in Predicate if p.direction])
+@pytest.mark.parametrize("predicate", [p for p in PREDICATES.values() if p.direction(Robot())])
 def test_goal_axes_turn_with_the_predicate(predicate: Predicate) -> None:
     """Turning the table by the angle between two predicates shows the heads the same thing."""
     generator = torch.Generator().manual_seed(4)
     position, size = (torch.rand(1, 5, 3, generator=generator) for _ in range(2))
     yaw = torch.rand(1, 5, generator=generator) * 3
-    u = predicate.direction
+    u = predicate.direction(Robot())
     assert u is not None
     turn = math.atan2(u[1], u[0])  # from `behind`, whose direction is +x
     c, s = math.cos(turn), math.sin(turn)
     turned = position @ torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     goals = torch.tensor([[[0, 1], [4, 2]]])
-    plain = models._goal_features(geometry(position, size, yaw), Predicate.BEHIND, goals)
+    plain = models._goal_features(geometry(position, size, yaw), PREDICATES["behind"], goals)
     other = models._goal_features(geometry(turned, size, yaw + turn), predicate, goals)
     torch.testing.assert_close(other, plain, atol=1e-5, rtol=0)
     assert plain.shape == (1, 2, 5, models._GOAL_FEATURES)

@@ -34,7 +34,7 @@ from relevance.pipeline import (
     work,
 )
 from relevance.sampling import SceneConfig, sample_goals, sample_scene
-from relevance.scene import FAMILIES, Predicate
+from relevance.scene import FAMILIES, PREDICATES
 from relevance.store import SPLITS, Dataset, DatasetError
 
 CONFIG = DatasetConfig(
@@ -125,7 +125,7 @@ def test_appending_never_renumbers(first: DatasetConfig, second: DatasetConfig) 
 
 def test_a_shard_knows_its_predicates() -> None:
     spec = ShardSpec(split="train", shard=0, family="on", first=0, count=1)
-    assert spec.predicates == (Predicate.ON,)
+    assert spec.predicates == (PREDICATES["on"],)
     assert len(replace(spec, family="same-plane").predicates) == 4
 
 
@@ -376,9 +376,9 @@ def test_plans_are_of_the_drawn_goals() -> None:
     plans = dataset.read_rows("plans")
     found = {(p["scene_id"], p["predicate"], p["subject"], p["reference"]) for p in plans}
     expected = {
-        (scene.id, goal.predicate.value, goal.subject, goal.reference)
+        (scene.id, goal.predicate.name, goal.subject, goal.reference)
         for scene in scenes.values()
-        for predicate in Predicate
+        for predicate in PREDICATES.values()
         if (predicate.family == "on") == any(box.on for box in scene.objects)
         for goal in sample_goals(scene, predicate, CONFIG.goals_per_scene, seed=CONFIG.seed)
     }

@@ -9,7 +9,7 @@ import pytest
 from relevance.benchmarks.reference import CLEARANCE, shortest
 from relevance.planner import Guide, PlannerConfig, penetration, plan
 from relevance.sampling import SceneConfig, sample_goals, sample_scene
-from relevance.scene import Box, Predicate, Scene, SceneError, goal_holds
+from relevance.scene import PREDICATES, Box, Scene, SceneError, goal_holds
 from relevance.simulation import replay
 
 RED, GREEN, BLUE, GREY = (0.8, 0.1, 0.1), (0.1, 0.7, 0.1), (0.1, 0.1, 0.8), (0.5, 0.5, 0.5)
@@ -25,7 +25,7 @@ OPEN = Scene(objects=(box("red", 0.0, 0.25, RED), box("blue", 0.0, -0.15, BLUE))
 def tasks(count, seed):
     """Random (scene, goal) pairs over all predicates, from fresh scenes."""
     found, index = [], 0
-    predicates = list(Predicate)
+    predicates = list(PREDICATES.values())
     while len(found) < count:
         predicate = predicates[index % len(predicates)]
         config = SceneConfig(family=predicate.family)
@@ -49,7 +49,7 @@ def test_every_solved_plan_replays_and_reaches_its_goal(planned):
         assert verdict.ok, f"{goal}: {verdict}"
         assert verdict.max_penetration <= 1e-3
         assert result.max_penetration <= 1e-3
-        assert goal_holds(scene.moved(result.final), goal)
+        assert goal_holds(scene.moved(result.final), goal, scene.robot)
 
 
 def test_dense_check_of_the_plan_alone_equals_the_solvers(planned):
@@ -66,7 +66,7 @@ def test_dense_check_of_the_plan_alone_equals_the_solvers(planned):
 
 def test_all_predicates_and_several_lengths_occur(planned):
     solved = [result for *_, result in planned if result.status == "solved"]
-    assert {result.goal.predicate for result in solved} == set(Predicate)
+    assert {result.goal.predicate for result in solved} == set(PREDICATES.values())
     assert {2, 4} <= {len(result.actions) for result in solved}
 
 

@@ -111,7 +111,7 @@ def test_rai_solves_and_its_plan_replays_with_the_same_seven_angles():
     assert result.status == "solved"
     assert result.moved == ("green", "red")
     assert [action.to_list() for action in result.actions][-1] == ["place", "red", "blue"]
-    assert goal_holds(SCENE.moved(result.final), result.goal, tolerance=2e-3)
+    assert goal_holds(SCENE.moved(result.final), result.goal, SCENE.robot, tolerance=2e-3)
     verdict = replay(SCENE, result.goal, result.phases)
     # The kinematics agree or every grasp would be refused; between steps rai may graze a box.
     assert verdict.ok or "penetrates" in verdict.reason

@@ -11,7 +11,10 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 
 ORDER = (
+    "errors",
+    "registry",
     "hashing",
+    "configs",
     "counters",
     "scene",
     "store",

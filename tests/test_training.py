@@ -22,7 +22,7 @@ from relevance import training
 from relevance.models import ModelConfig, RelevanceModel, relevance_loss
 from relevance.pipeline import Counts, DatasetConfig, generate_shard, prepare
 from relevance.sampling import SceneConfig, sample_goals
-from relevance.scene import Camera, Predicate
+from relevance.scene import PREDICATES, Camera
 from relevance.store import Dataset, DatasetError
 from relevance.training import (
     CheckpointError,
@@ -45,7 +45,7 @@ from relevance.training.examples import (
 
 torch.set_num_threads(1)  # threads that wait for each other crawl on a busy machine
 
-SAME_PLANE = tuple(p for p in Predicate if p is not Predicate.ON)
+SAME_PLANE = tuple(p for p in PREDICATES.values() if p is not PREDICATES["on"])
 DATA = DatasetConfig(
     seed=5,
     train=Counts(same_plane=6, on=4),
@@ -64,7 +64,7 @@ CONFIG = TrainConfig(
 
 def label(dataset: Dataset) -> None:
     """Labels by a rule that needs no planner: the subject, and what stands within 20 cm of it."""
-    for predicate in Predicate:
+    for predicate in PREDICATES.values():
         for split in ("train", "validation"):
             for shard in dataset.shards(split, predicate.family):
                 rows = []
@@ -81,7 +81,7 @@ def label(dataset: Dataset) -> None:
                                     "scene_id": scene.id,
                                     "split": split,
                                     "shard": shard,
-                                    "predicate": predicate.value,
+                                    "predicate": predicate.name,
                                     **names,
                                     "query": box.name,
                                     "relevant": bool(near and box.name != goal.reference),
@@ -94,7 +94,7 @@ def label(dataset: Dataset) -> None:
                                 }
                             )
                 dataset.write_rows(
-                    "labels", rows, split=split, shard=shard, predicate=predicate.value
+                    "labels", rows, split=split, shard=shard, predicate=predicate.name
                 )
 
 
@@ -125,15 +125,20 @@ def examples(made: Path) -> Examples:
 def test_polling_takes_the_predicates_in_turn(examples: Examples) -> None:
     strict = replace(CONFIG, share_encodings=False, mirror=False)
     seen = [draw_batch(examples, strict, step).turns[0][0] for step in range(12)]
-    assert seen == [*Predicate, *Predicate, *list(Predicate)[:2]]
+    assert seen == [*PREDICATES.values(), *PREDICATES.values(), *list(PREDICATES.values())[:2]]
     shared = replace(strict, share_encodings=True)
     steps = [[turn[0] for turn in draw_batch(examples, shared, s).turns] for s in range(4)]
-    assert steps == [[*SAME_PLANE], [Predicate.ON]] * 2
-    assert [p for step in steps for p in step] == [*Predicate, *Predicate]
+    assert steps == [[*SAME_PLANE], [PREDICATES["on"]]] * 2
+    assert [p for step in steps for p in step] == [*PREDICATES.values(), *PREDICATES.values()]
 
 
 def test_polling_shares_steps_only_among_neighbours_of_a_family() -> None:
-    mixed = [Predicate.ON_THE_LEFT, Predicate.ON, Predicate.BEHIND, Predicate.IN_FRONT]
+    mixed = [
+        PREDICATES["on-the-left"],
+        PREDICATES["on"],
+        PREDICATES["behind"],
+        PREDICATES["in-front"],
+    ]
     assert polling(mixed, share=True) == [(mixed[0],), (mixed[1],), (mixed[2], mixed[3])]
     assert polling(mixed, share=False) == [(p,) for p in mixed]
 
@@ -148,7 +153,7 @@ def test_a_predicate_without_labels_is_left_out(root: Path) -> None:
 
 def test_every_scene_comes_before_any_comes_again(examples: Examples) -> None:
     config = replace(CONFIG, scenes_per_batch=3, mirror=False, recolor=False)
-    for first, own in ((0, examples.scenes(SAME_PLANE)), (1, examples.scenes([Predicate.ON]))):
+    for first, own in ((0, examples.scenes(SAME_PLANE)), (1, examples.scenes([PREDICATES["on"]]))):
         shown: list[int] = []
         for step in range(first, first + 2 * 2 * len(own), 2):
             image = draw_batch(examples, config, step).image.permute(0, 2, 3, 1).numpy()
@@ -199,10 +204,10 @@ def test_examples_are_the_stored_scenes_and_labels(made: Path, examples: Example
             np.testing.assert_allclose(row[[6, 10]] / 10, box.extents, atol=1e-6)
         shown = set(np.unique(examples.cells[i])) - {0}
         assert shown == set(range(1, count + 1))
-    for predicate in Predicate:
+    for predicate in PREDICATES.values():
         goals = examples.goals[predicate]
         expected = {}
-        for row in dataset.read_rows("labels", split="train", predicate=predicate.value):
+        for row in dataset.read_rows("labels", split="train", predicate=predicate.name):
             names = samples[place[row["scene_id"]]].scene.names
             key = place[row["scene_id"]], names.index(row["subject"]), names.index(row["reference"])
             expected.setdefault(key, {})[names.index(row["query"])] = row["relevant"]
@@ -229,8 +234,8 @@ def test_ambiguous_goals_and_other_policies_can_be_left_out(made: Path, examples
     dataset = Dataset.open(made)
     clear = load_examples(dataset, "train", camera=Camera(), ambiguous=False)
     rows = dataset.read_rows("labels", split="train", predicate="on", ambiguous=False)
-    assert len(clear.goals[Predicate.ON].pairs) == len({row["plan_id"] for row in rows})
-    assert len(clear.goals[Predicate.ON].pairs) < len(examples.goals[Predicate.ON].pairs)
+    assert len(clear.goals[PREDICATES["on"]].pairs) == len({row["plan_id"] for row in rows})
+    assert len(clear.goals[PREDICATES["on"]].pairs) < len(examples.goals[PREDICATES["on"]].pairs)
     assert load_examples(dataset, "train", camera=Camera(), policy="none").goals == {}
 
 
@@ -347,7 +352,7 @@ def test_train_writes_a_checkpoint_and_its_row(root: Path) -> None:
     assert meta["dataset_hash"] == row["dataset_hash"] == dataset.content_hash()
     assert TrainConfig.from_dict(meta["config"]) == CONFIG
     assert meta["metrics"] == json.loads(row["metrics"])
-    assert set(meta["metrics"]) == {*(p.value for p in Predicate), "same-plane"}
+    assert set(meta["metrics"]) == {*(p.name for p in PREDICATES.values()), "same-plane"}
     validation = load_examples(dataset, "validation", camera=Camera())
     assert measure(model, validation) == meta["metrics"], "the file holds the trained weights"
     assert [entry["step"] for entry in meta["history"]] == [1, 2, 3, 4, 5, 6]
@@ -500,17 +505,17 @@ def test_measure_counts_queries_and_goals(examples: Examples, made: Path) -> Non
     model = RelevanceModel(CONFIG.model)
     found = measure(model, examples, batch=3)
     rows = Dataset.open(made).read_rows("labels", split="train")
-    for predicate in Predicate:
-        own = [row for row in rows if row["predicate"] == predicate.value]
+    for predicate in PREDICATES.values():
+        own = [row for row in rows if row["predicate"] == predicate.name]
         queries = [row for row in own if not row["is_goal_object"]]
-        group = found[predicate.value]
+        group = found[predicate.name]
         assert group["goals"] == len({row["plan_id"] for row in own})
         for name, part in (("queries", queries), ("with_goal_objects", own)):
             relevant = sum(row["relevant"] for row in part)
             assert group[name]["relevant"] == relevant
             assert group[name]["irrelevant"] == len(part) - relevant
             assert group[name]["base_rate"] == pytest.approx(1 - relevant / len(part))
-    assert found["same-plane"]["goals"] == sum(found[p.value]["goals"] for p in SAME_PLANE)
+    assert found["same-plane"]["goals"] == sum(found[p.name]["goals"] for p in SAME_PLANE)
 
 
 @pytest.mark.parametrize(

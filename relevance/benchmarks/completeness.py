@@ -76,7 +76,7 @@ def compared(task: Task, config: PlannerConfig) -> Compared:
         task=task.index,
         scene_id=task.scene.id,
         goal=str(task.goal),
-        predicate=task.goal.predicate.value,
+        predicate=task.goal.predicate.name,
         n_objects=task.n_objects,
         status=result.status,
         reason=result.reason,

@@ -17,7 +17,7 @@ import numpy as np
 
 from relevance.planner.kinematics import reach_interval
 from relevance.planner.placement import LIFT, Grasp, grasps
-from relevance.scene import Box, Goal, Predicate, Scene, region
+from relevance.scene import Box, Goal, Scene
 
 CLEARANCE = 0.003
 """What the planner keeps clear as well, m."""
@@ -79,8 +79,8 @@ def _takes(scene: Scene, box: Box, standing: Sequence[Box]) -> bool:
 
 def _stands(scene: Scene, goal: Goal, standing: Sequence[Box], clearance: float) -> bool:
     subject, reference = scene[goal.subject], scene[goal.reference]
-    bottom = reference.top if goal.predicate is Predicate.ON else 0.0
-    poses = _poses(_region(subject, reference, goal.predicate, clearance - CLEARANCE))
+    bottom = reference.top if goal.predicate.stacked else 0.0
+    poses = _poses(_region(scene, goal, clearance - CLEARANCE))
     return _free(scene, subject, poses, bottom, standing, clearance)
 
 
@@ -92,21 +92,15 @@ def _has_room(scene: Scene, box: Box, standing: Sequence[Box], clearance: float)
     return _free(scene, box, _poses(points), 0.0, others, clearance)
 
 
-def _region(subject: Box, reference: Box, predicate: Predicate, inset: float) -> np.ndarray:
+def _region(scene: Scene, goal: Goal, inset: float) -> np.ndarray:
     """Grid points (N, 2) of the goal region for the subject's centre, from border to border."""
     steps = np.linspace(-1, 1, CELLS)
-    u = predicate.direction
-    if u is None:
-        half = [edge / 2 - inset for edge in reference.size[:2]]
-        a, b = np.meshgrid(steps * half[0], steps * half[1])
-        c, s = math.cos(reference.yaw), math.sin(reference.yaw)
-        local = np.stack([c * a - s * b, s * a + c * b], axis=-1)
-    else:
-        low, high, width = region(subject, reference, predicate)
-        depth, width = (high - low) / 2 - inset, max(width - inset, 0.0)
-        along, across = np.meshgrid((low + high) / 2 + steps * depth, steps * width)
-        local = np.stack([along * u[0] - across * u[1], along * u[1] + across * u[0]], axis=-1)
-    return local.reshape(-1, 2) + np.array(reference.position[:2])
+    there = goal.predicate.region(scene[goal.subject], scene[goal.reference], scene.robot)
+    half = [max(extent - inset, 0.0) for extent in there.half]
+    a, b = np.meshgrid(steps * half[0], steps * half[1])
+    c, s = math.cos(there.angle), math.sin(there.angle)
+    local = np.stack([c * a - s * b, s * a + c * b], axis=-1)
+    return local.reshape(-1, 2) + np.array([there.x, there.y])
 
 
 def _poses(points: np.ndarray) -> np.ndarray:

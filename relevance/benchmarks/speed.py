@@ -81,7 +81,7 @@ def planned(task: Task, config: PlannerConfig) -> tuple[Planned, PlanResult]:
     row = Planned(
         task=task.index,
         scene_id=task.scene.id,
-        predicate=task.goal.predicate.value,
+        predicate=task.goal.predicate.name,
         subject=task.goal.subject,
         reference=task.goal.reference,
         n_objects=task.n_objects,

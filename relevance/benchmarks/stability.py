@@ -90,7 +90,7 @@ def jittered(task: Task, seed: int, config: PlannerConfig) -> Iterator[Jittered]
             jitter=draw,
             scene_id=task.scene.id,
             goal=str(task.goal),
-            predicate=task.goal.predicate.value,
+            predicate=task.goal.predicate.name,
             n_objects=task.n_objects,
             status=first.status,
             status_moved=moved.status,

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from relevance.errors import RelevanceError
 from relevance.sampling import SceneConfig, sample_goals, sample_scene
-from relevance.scene import Goal, Predicate, Scene
+from relevance.scene import PREDICATES, Goal, Predicate, Scene
 
 BOXES = (3, 10)
 """Fewest and most boxes of a task, stacked ones included."""
@@ -14,7 +15,7 @@ ATTEMPTS = 2000
 _STREAM = "bench"  # a split of its own: never a scene of a dataset
 
 
-class BenchmarkError(ValueError):
+class BenchmarkError(RelevanceError):
     """A measurement that cannot be made: says which setting, its value and what was expected."""
 
 
@@ -52,7 +53,7 @@ def draw(
         raise BenchmarkError(f"seed = {seed}: expected 0 to 2**63 - 1")
     if not 3 <= boxes[0] <= boxes[1]:
         raise BenchmarkError(f"boxes = {boxes}: expected 3 <= fewest <= most")
-    predicates = tuple(Predicate)
+    predicates = tuple(PREDICATES.values())
     sizes = range(boxes[0], boxes[1] + 1)
     return [
         _task(
@@ -71,7 +72,7 @@ def _task(
     index: int, predicate: Predicate, boxes: int, seed: int, max_edge: float, stream: str
 ) -> Task:
     # The `on` family has one box more than its config says.
-    count = boxes - (predicate is Predicate.ON)
+    count = boxes - (predicate.stacked)
     start = SceneConfig(family=predicate.family, min_objects=2, max_edge=max_edge)
     config = replace(start, min_objects=count, max_objects=count)
     for attempt in range(ATTEMPTS):

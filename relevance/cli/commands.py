@@ -58,12 +58,12 @@ def _generate(preset: Preset) -> Callable[..., int]:
 def _label(_: Preset) -> Callable[..., int]:
     from relevance.labels import POLICIES
     from relevance.pipeline import finish, label_shard, labelled, load_config, prepare
-    from relevance.scene import Predicate
+    from relevance.scene import PREDICATES
     from relevance.store import Dataset, sql
 
     def label(
         dataset: DatasetArg,
-        predicates: tuple[Predicate, ...] = tuple(Predicate),
+        predicates: tuple[str, ...] = tuple(PREDICATES),
         policy: OptionalName = None,
         replan: bool = False,
         goals_per_scene: OptionalCount = None,
@@ -86,6 +86,8 @@ def _label(_: Preset) -> Callable[..., int]:
         """
         if policy is not None and policy not in POLICIES:
             raise UsageError(f"--policy {policy}: expected one of {', '.join(POLICIES)}")
+        for name in predicates:
+            PREDICATES[name]  # refuses an unknown one
         there = Dataset.open(dataset)
         config = load_config(there)
         goals = {"goals_per_scene": goals_per_scene, "goals_seed": goals_seed}
@@ -95,7 +97,7 @@ def _label(_: Preset) -> Callable[..., int]:
             (spec, predicate)
             for spec in prepare(dataset, config, replan=replan or bool(goals))
             for predicate in spec.predicates
-            if predicate in predicates
+            if predicate.name in predicates
         ]
         missing = [pair for pair in pairs if not labelled(there, config, *pair, policy)]
         stage = functools.partial(label_shard, policy=policy)

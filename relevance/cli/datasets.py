@@ -151,7 +151,7 @@ def _repair(_: Preset) -> Callable[..., int]:
         """
         from relevance import pipeline
         from relevance.pipeline.checking import check
-        from relevance.scene import Predicate
+        from relevance.scene import PREDICATES
         from relevance.store import Dataset
 
         with bar("files checked") as progress:
@@ -161,9 +161,9 @@ def _repair(_: Preset) -> Callable[..., int]:
         there = Dataset.open(dataset)
         predicates = [
             predicate
-            for predicate in Predicate
-            if there.files("labels", predicate=predicate.value)
-            or predicate.value in there.description.get("finished", ())
+            for predicate in PREDICATES.values()
+            if there.files("labels", predicate=predicate.name)
+            or predicate.name in there.description.get("finished", ())
         ]
         policies = sorted({of.policy for of in there.labellings()})
         pipeline.repair(dataset, named)

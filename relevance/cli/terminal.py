@@ -22,12 +22,14 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from relevance.errors import RelevanceError
+
 Format = Literal["table", "json", "csv"]
 
 console = Console(stderr=True)
 
 
-class UsageError(ValueError):
+class UsageError(RelevanceError):
     """A command line that asks for what cannot be."""
 
 

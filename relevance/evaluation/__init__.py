@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from relevance.errors import RelevanceError
 from relevance.hashing import content_hash
 from relevance.planner import (
     GUIDES,
@@ -35,7 +36,7 @@ from relevance.planner import (
     plan,
 )
 from relevance.planner.search import Mode
-from relevance.scene import Goal, Predicate, Scene
+from relevance.scene import PREDICATES, Goal, Scene
 from relevance.store import SPLITS, Dataset
 
 if TYPE_CHECKING:  # models imports torch, which the planner and the report do without
@@ -44,7 +45,7 @@ if TYPE_CHECKING:  # models imports torch, which the planner and the report do w
 Progress = Callable[[int, int], None]
 
 
-class EvaluationError(ValueError):
+class EvaluationError(RelevanceError):
     """Settings or data that cannot be evaluated: says which, and what was expected."""
 
 
@@ -284,7 +285,7 @@ def choose_tasks(dataset: Dataset, *, split: str, per_predicate: int) -> list[Ta
             plan_id=plan_id,
             scene_id=scene_id,
             shard=shard,
-            goal=Goal(predicate=Predicate(predicate), subject=subject, reference=reference),
+            goal=Goal(predicate=PREDICATES[predicate], subject=subject, reference=reference),
             nth=nth,
         )
         for plan_id, scene_id, shard, predicate, subject, reference, nth in rows
@@ -418,7 +419,7 @@ def compare(
                     "search": search,
                     "beta": beta,
                     "scene_id": scene.id,
-                    "predicate": goal.predicate.value,
+                    "predicate": goal.predicate.name,
                     "subject": goal.subject,
                     "reference": goal.reference,
                     "n_objects": len(scene.objects),
@@ -453,5 +454,5 @@ def _timed(scene: Scene, goal: Goal, planner: PlannerConfig, guide: Guide | None
 
 def _goal(row: dict[str, Any]) -> Goal:
     return Goal(
-        predicate=Predicate(row["predicate"]), subject=row["subject"], reference=row["reference"]
+        predicate=PREDICATES[row["predicate"]], subject=row["subject"], reference=row["reference"]
     )

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from relevance.scene import Predicate
+from relevance.scene import PREDICATES
 from relevance.store import Dataset
 
 CONFIDENCE = 0.67
@@ -71,9 +71,7 @@ class Predictions:
         """Rows of one predicate, or of the family `same-plane`; `all` gives everything."""
         if group == "all":
             return self
-        if group == "same-plane":
-            return self.where(self.predicate != Predicate.ON.value)
-        return self.where(self.predicate == group)
+        return self.where(np.array([in_group(name, group) for name in self.predicate], bool))
 
     def queries(self) -> Predictions:
         """Rows other than those of subject and reference."""
@@ -283,7 +281,7 @@ def settings(
 
 def in_group(predicate: str, group: str) -> bool:
     """Whether a predicate belongs to `all`, to a family or is the group itself."""
-    return group == "all" or group == predicate or Predicate(predicate).family == group
+    return group == "all" or group == predicate or PREDICATES[predicate].family == group
 
 
 def _mean(values: Any) -> float:

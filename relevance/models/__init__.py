@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from relevance.sampling import camera_up
-from relevance.scene import Camera, Predicate
+from relevance.scene import PREDICATES, Camera, Predicate, Robot
 
 PATCH = 32
 """Edge of image patches and canonical views, pixels (the paper's)."""
@@ -134,7 +134,7 @@ class RelevanceModel(nn.Module):
 
     def decode(self, encoding: Encoding, predicate: Predicate | str, goals: Tensor) -> Tensor:
         """Scores (B, G, N), float32 logits, for goals (B, G, 2): subject and reference index."""
-        return self.body.decode(encoding, Predicate(predicate), goals).float()
+        return self.body.decode(encoding, PREDICATES[str(predicate)], goals).float()
 
     @torch.inference_mode()
     def encode_scene(self, image: np.ndarray, views: np.ndarray) -> Encoding:
@@ -208,7 +208,7 @@ class ViTBody(nn.Module):
         self.layers = nn.ModuleList(Attention(width, config.heads) for _ in range(config.layers))
         self.norm = nn.LayerNorm(width)
         self.extractors = nn.ModuleDict(
-            {predicate.value: _Extractor(width, config.hidden) for predicate in Predicate}
+            {predicate.name: _Extractor(width, config.hidden) for predicate in PREDICATES.values()}
         )
 
     def encode(self, image: Tensor, views: Tensor, present: Tensor) -> Encoding:
@@ -225,7 +225,7 @@ class ViTBody(nn.Module):
 
     def decode(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
         """As `RelevanceModel.decode`."""
-        return self.extractors[predicate.value](encoding.tokens, goals)
+        return self.extractors[predicate.name](encoding.tokens, goals)
 
 
 class _Extractor(nn.Module):
@@ -284,17 +284,17 @@ class GlimpseBody(nn.Module):
             nn.Linear(_GOAL_FEATURES, width), nn.GELU(), nn.Linear(width, width)
         )
         self.predicate = nn.ParameterDict(
-            {predicate.value: nn.Parameter(torch.zeros(width)) for predicate in Predicate}
+            {predicate.name: nn.Parameter(torch.zeros(width)) for predicate in PREDICATES.values()}
         )
         self.goal_layers = nn.ModuleList(
             Attention(width, config.heads, expansion=2) for _ in range(config.layers)
         )
         self.heads = nn.ModuleDict(
             {
-                predicate.value: nn.Sequential(
+                predicate.name: nn.Sequential(
                     nn.LayerNorm(width), nn.Linear(width, width), nn.GELU(), nn.Linear(width, 1)
                 )
-                for predicate in Predicate
+                for predicate in PREDICATES.values()
             }
         )
         self.cells_P2: Tensor
@@ -347,12 +347,12 @@ class GlimpseBody(nn.Module):
         tokens, present = encoding.tokens, encoding.present
         batch, objects = present.shape
         features = _goal_features(encoding.geometry, predicate, goals)
-        x = tokens[:, None] + self.place(features) + self.predicate[predicate.value]
+        x = tokens[:, None] + self.place(features) + self.predicate[predicate.name]
         x = x.flatten(0, 1)
         allowed = _columns(present).repeat_interleave(goals.shape[1], dim=0)
         for layer in self.goal_layers:
             x = layer(x, allowed)
-        return self.heads[predicate.value](x).view(batch, -1, objects)
+        return self.heads[predicate.name](x).view(batch, -1, objects)
 
 
 BODIES: dict[str, type[ViTBody] | type[GlimpseBody]] = {"glimpse": GlimpseBody, "vit": ViTBody}
@@ -386,7 +386,7 @@ def _goal_features(geometry: Tensor, predicate: Predicate, goals: Tensor) -> Ten
     subject's, the reference's, two role flags, and for subject and reference the distance
     and the signed clearance of the footprints along both axes: what "beside" turns on.
     """
-    u = predicate.direction or (1.0, 0.0)
+    u = predicate.direction(Robot()) or (1.0, 0.0)
     axes = torch.tensor([[u[0], u[1]], [-u[1], u[0]]])
     # Extents along the goal's axes: a quarter turn is half of the regressed directions.
     extents = geometry[..., 6:].roll(0 if u[0] else ANGLES // 2, dims=-1)

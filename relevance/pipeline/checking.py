@@ -273,7 +273,7 @@ def _goals(dataset: Dataset, left_out: set[Path]) -> Iterator[Breach]:
                     file=_name(dataset, file), row=row, column="subject", message=str(error)
                 )
                 continue
-            fulfilled = goal_holds(scene.moved(final), goal)
+            fulfilled = goal_holds(scene.moved(final), goal, scene.robot)
             if not fulfilled:
                 yield Breach(
                     file=_name(dataset, file),

@@ -16,7 +16,7 @@ from relevance.hashing import content_hash
 from relevance.labels import POLICIES
 from relevance.planner import PLANNER_VERSION, PlannerConfig
 from relevance.sampling import GoalConfig, SceneConfig
-from relevance.scene import FAMILIES, Predicate
+from relevance.scene import FAMILIES, PREDICATES, Predicate
 from relevance.store import (
     SPLITS,
     TABLES,
@@ -183,7 +183,7 @@ class ShardSpec:
     @property
     def predicates(self) -> tuple[Predicate, ...]:
         """The predicates that its scenes are asked."""
-        return tuple(p for p in Predicate if p.family == self.family)
+        return tuple(p for p in PREDICATES.values() if p.family == self.family)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -39,7 +39,7 @@ from relevance.pipeline.settings import (
 )
 from relevance.planner import plan, warm_up
 from relevance.sampling import SceneConfig, sample_goals, sample_scene
-from relevance.scene import Predicate, Scene, scene_to_json
+from relevance.scene import PREDICATES, Predicate, Scene, scene_to_json
 from relevance.simulation import Renderer, Rendering, rejects, replay
 from relevance.store import Dataset, DatasetError, Labelling, copy_file
 
@@ -172,9 +172,9 @@ def label_shard(
     dataset's own, beside those. Raises DatasetError when the scenes are not there, ValueError
     for an unknown policy or a predicate of another family.
     """
-    predicate = Predicate(predicate)
+    predicate = PREDICATES[str(predicate)]
     if predicate not in spec.predicates:
-        raise ValueError(f"{predicate.value}: expected a predicate of family {spec.family}")
+        raise ValueError(f"{predicate.name}: expected a predicate of family {spec.family}")
     own = config.labelling
     aim = replace(own, policy=policy or own.policy)
     if aim.policy not in POLICIES:
@@ -211,7 +211,7 @@ def label_shard(
     dataset.write_rows("labels", labels, made_by=aim.made_by, of=of, **where)
     taken = watch.read()
     if not planned:
-        _took(dataset, predicate.value, spec, len(plans), taken)
+        _took(dataset, predicate.name, spec, len(plans), taken)
     return _labelling_report(spec, predicate, plans, skipped=False, seconds=taken["seconds"])
 
 
@@ -225,7 +225,7 @@ def _labelling_report(
 ) -> ShardReport:
     return ShardReport(
         spec=spec,
-        predicate=predicate.value,
+        predicate=predicate.name,
         skipped=skipped,
         rows=len(plans),
         holds=sum(row["holds"] for row in plans),
@@ -293,7 +293,7 @@ def _chosen(scene_id: str, goal: str, share: float) -> bool:
 
 
 def _where(spec: ShardSpec, predicate: Predicate | str) -> dict[str, Any]:
-    return {"split": spec.split, "shard": spec.shard, "predicate": Predicate(predicate).value}
+    return {"split": spec.split, "shard": spec.shard, "predicate": str(predicate)}
 
 
 def _planned(dataset: Dataset, own: Labelling, where: dict[str, Any]) -> bool:

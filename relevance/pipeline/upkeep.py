@@ -13,7 +13,7 @@ from pathlib import Path
 
 from relevance.pipeline.settings import ShardSpec, shards_of
 from relevance.pipeline.shards import generated
-from relevance.scene import Predicate
+from relevance.scene import PREDICATES
 from relevance.store import Dataset, DatasetError
 
 REMADE = ("scenes", "images", "plans", "timings", "labels", "durations", "beside", "compacted")
@@ -27,10 +27,10 @@ def finish(root: str | Path) -> None:
     finished = [
         *(["scenes"] if all(generated(dataset, spec) for spec in specs) else []),
         *(
-            predicate.value
-            for predicate in Predicate
+            predicate.name
+            for predicate in PREDICATES.values()
             for mine in [[spec for spec in specs if predicate in spec.predicates]]
-            if mine and not any(_missing(dataset, spec, predicate.value) for spec in mine)
+            if mine and not any(_missing(dataset, spec, predicate.name) for spec in mine)
         ),
     ]
     if dataset.description.get("finished") != finished:
@@ -61,8 +61,8 @@ def integrity(dataset: Dataset) -> Iterator[tuple[str, str]]:
                 if not file.is_file():
                     yield dataset.name_of(file), expected
         for predicate in spec.predicates:
-            if predicate.value in finished:
-                for file in _missing(dataset, spec, predicate.value):
+            if predicate.name in finished:
+                for file in _missing(dataset, spec, predicate.name):
                     yield dataset.name_of(file), expected
     yield from _stale(dataset)
     yield from _beside(dataset)

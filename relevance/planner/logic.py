@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from relevance.scene import Action, Goal, Predicate, Scene
+from relevance.scene import Action, Goal, Scene
 
 
 def stacked_on(scene: Scene) -> dict[str, frozenset[str]]:
@@ -23,7 +23,7 @@ def actions(goal: Goal, order: Sequence[str]) -> tuple[Action, ...]:
     found = []
     for name in order:
         last = name == goal.subject
-        support = goal.reference if last and goal.predicate is Predicate.ON else "table"
+        support = goal.reference if last and goal.predicate.stacked else "table"
         found.append(Action(name="pick", object=name))
         found.append(Action(name="place", object=name, support=support))
     return tuple(found)

@@ -27,7 +27,7 @@ from relevance.planner.kinematics import (
     reach_interval,
 )
 from relevance.planner.placement import EDGE, FOUND, NONE, UNDECIDED, Grasp
-from relevance.scene import Box, Goal, Phase, Pose, Predicate, Scene, region
+from relevance.scene import Box, Goal, Phase, Pose, Scene
 
 REGION_MARGIN = 0.0005
 """How far inside the goal region a subject is placed, m."""
@@ -180,7 +180,7 @@ class Problem:
         if key in self._memo:
             return self._memo[key]
         subject = self.boxes[self.goal.subject]
-        bottom = reference.top if self.goal.predicate is Predicate.ON else 0.0
+        bottom = reference.top if self.goal.predicate.stacked else 0.0
         standing = self._standing(gone | {subject.name, reference.name})
         standing = np.vstack([standing, placement.obstacle(reference)])
         area = self.goal_region(reference)
@@ -189,16 +189,10 @@ class Problem:
 
     def goal_region(self, reference: Box) -> np.ndarray:
         """Rectangle for the subject's centre: x, y, angle, half extents (5,)."""
-        if self.goal.predicate is Predicate.ON:
-            half = [max(edge / 2 - REGION_MARGIN, 0.0) for edge in reference.size[:2]]
-            return np.array([*reference.position[:2], reference.yaw, *half])
-        u = self.goal.predicate.direction
-        assert u is not None
-        low, high, width = region(self.boxes[self.goal.subject], reference, self.goal.predicate)
-        middle = (low + high) / 2
-        depth, width = (high - low) / 2 - REGION_MARGIN, max(width - REGION_MARGIN, 0.0)
-        x, y = reference.position[0] + middle * u[0], reference.position[1] + middle * u[1]
-        return np.array([x, y, 0.0, *((depth, width) if u[0] else (width, depth))])
+        subject = self.boxes[self.goal.subject]
+        there = self.goal.predicate.region(subject, reference, self.scene.robot)
+        half = [max(extent - REGION_MARGIN, 0.0) for extent in there.half]
+        return np.array([there.x, there.y, there.angle, *half])
 
     def _find(self, area, prefer, bottom, box, grasp, obstacles):
         began = time.process_time()
@@ -230,7 +224,7 @@ class Problem:
             pose = self.goal_pose(gone - {subject.name}, grasp, reference)
             if pose is None:
                 continue
-            bottom = reference.top if self.goal.predicate is Predicate.ON else 0.0
+            bottom = reference.top if self.goal.predicate.stacked else 0.0
             kept = placement.volumes(grasp.parts, pose, bottom, bottom + subject.size[2], SKY)
             found = self._place_blockers(order, kept, reference)
             if found is not None:
@@ -330,7 +324,7 @@ class Problem:
         for j, (name, place) in enumerate(zip(order, placements, strict=True)):
             box, grasp = self.boxes[name], place.grasp
             bottom = 0.0
-            if name == self.goal.subject and self.goal.predicate is Predicate.ON:
+            if name == self.goal.subject and self.goal.predicate.stacked:
                 supports[j], bottom = self.index[reference.name], reference.top
             moved[self.index[name]] = j
             pick[j] = self.pick_target(box, grasp)
@@ -401,7 +395,7 @@ class Problem:
         for j, (name, place) in enumerate(zip(order, placements, strict=True)):
             box, grasp, i = self.boxes[name], place.grasp, self.index[name]
             last = name == self.goal.subject
-            on = self.goal.reference if last and self.goal.predicate is Predicate.ON else None
+            on = self.goal.reference if last and self.goal.predicate.stacked else None
             bottom = 0.0
             if on is not None:
                 bottom = obstacles[self.index[on], 2] + obstacles[self.index[on], 6]

@@ -131,7 +131,7 @@ def plan(
     for name in everything - set(scene.names):
         raise SceneError(f"movable: no object {name!r}, expected some of {', '.join(scene.names)}")
     began = time.process_time()
-    if goal_holds(scene.objects, goal):
+    if goal_holds(scene.objects, goal, scene.robot):
         seconds = Seconds(total=time.process_time() - began)
         return PlanResult(
             goal=goal, status="solved", final={}, cost=0.0, check_ok=True, counts=Counts(),

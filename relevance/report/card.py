@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from relevance.report.tables import Statistics, Table, cell, statistics
-from relevance.scene import Predicate
+from relevance.scene import PREDICATES
 from relevance.store import Dataset
 
 PAGE = "README.md"
@@ -147,7 +147,7 @@ def _balance(found: Statistics) -> dict[str, tuple[int, int]]:
     """Queries and relevant ones of each family."""
     sums = {"same-plane": (0, 0), "on": (0, 0)}
     for row in _dicts(found["label_balance"]):
-        family = Predicate(row["predicate"]).family
+        family = PREDICATES[row["predicate"]].family
         queries, relevant = sums[family]
         sums[family] = queries + row["queries"], relevant + row["relevant"]
     return sums
@@ -158,7 +158,7 @@ def _label_balance(found: Statistics) -> Figure | None:
     if not rows:
         return None
     figure, (ax,) = _figure(1)
-    predicates = [p.value for p in Predicate if any(r["predicate"] == p.value for r in rows)]
+    predicates = [name for name in PREDICATES if any(r["predicate"] == name for r in rows)]
     splits = [s for s in SPLIT_COLORS if any(r["split"] == s for r in rows)]
     width = 0.8 / len(splits)
     for i, split in enumerate(splits):
@@ -197,7 +197,7 @@ def _lengths(found: Statistics) -> Figure | None:
         (left, lengths, "n_actions", "actions of the plan"),
         (right, blockers, "blockers", "objects in the way"),
     ):
-        _shares(ax, rows, key, "plans", lambda row: Predicate(row["predicate"]).family)
+        _shares(ax, rows, key, "plans", lambda row: PREDICATES[row["predicate"]].family)
         ax.set_xlabel(label)
     left.legend(fontsize=8, frameon=False)
     return figure

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from relevance.hashing import content_hash
-from relevance.scene import Predicate
+from relevance.scene import PREDICATES
 from relevance.store import Dataset, Sample
 
 Rows = Callable[..., list[dict[str, Any]]]
@@ -97,7 +97,7 @@ def choose_examples(
     scores: dict[str, dict[str, float]] = {}
     for row in predictions:
         scores.setdefault(anchor(row), {})[row["query"]] = row["score"]
-    order = list(Predicate)
+    order = list(PREDICATES)
     for key, row in chosen.items():
         row |= {"anchor": key, "note": note if key in failed else "", "scores": scores.get(key, {})}
     return sorted(chosen.values(), key=lambda r: (bool(r["note"]), order.index(r["predicate"])))

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from relevance.evaluation.comparisons import Comparison, Predictions, guided_cost, mean_interval
-from relevance.scene import Predicate
+from relevance.scene import PREDICATES as KNOWN
 
 PAPER_ACCURACY = {"same-plane": (0.90, 0.95, 0.94), "on": (0.76, 0.89, 0.87)}
 """True relevant, true irrelevant and total of the paper's network."""
@@ -31,7 +31,7 @@ PAPER_RELEVANT = {"same-plane": 0.14, "on": 0.30}
 PAPER_SECONDS = (3.1, 4.7)
 """Range of the paper's mean planning times a task, s."""
 GROUPS = ("same-plane", "on")
-PREDICATES = tuple(predicate.value for predicate in Predicate)
+PREDICATES = tuple(KNOWN)
 
 DASH, TIMES = "\u2013", "\u00d7"
 INK, MUTED, FAINT = "#22282f", "#6b7480", "#d9dde2"
@@ -135,13 +135,13 @@ def label_shares(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     groups = [row["predicate"] for row in rows]
     y = np.arange(len(rows))[::-1]
     shares = [row["relevant_share"] or 0.0 for row in rows]
-    colors = [GROUP_COLOR[Predicate(group).family] for group in groups]
+    colors = [GROUP_COLOR[KNOWN[group].family] for group in groups]
     ax.barh(y, shares, height=0.56, color=colors)
     end = max([*shares, 0.3]) * 1.08
     for at, row, share in zip(y, rows, shares, strict=True):
         text = f"{100 * share:.1f}% of {row['queries']}"
         ax.text(end * 1.03, at, text, va="center", fontsize=8.5)
-        paper = PAPER_RELEVANT[Predicate(row["predicate"]).family]
+        paper = PAPER_RELEVANT[KNOWN[row["predicate"]].family]
         ax.plot([paper, paper], [at - 0.38, at + 0.38], color=INK, linewidth=1.6)
     ax.set_yticks(y, groups)
     ax.set_xlim(0, end)
@@ -156,7 +156,7 @@ def lengths(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     for number, group in enumerate(GROUPS):
         counts = Counter()
         for row in rows:
-            if Predicate(row["predicate"]).family == group:
+            if KNOWN[row["predicate"]].family == group:
                 counts[row["n_actions"]] += row["plans"]
         total = sum(counts.values())
         if total:
@@ -208,7 +208,7 @@ def accuracy(ax: Axes, predictions: Predictions) -> None:
         for row, group in enumerate(groups):
             y = len(groups) - 1 - row + (1 - number) * 0.22
             value = getattr(predictions.of(group).accuracy(), attribute)
-            paper = PAPER_ACCURACY[Predicate(group).family][number]
+            paper = PAPER_ACCURACY[KNOWN[group].family][number]
             ax.plot([paper, value], [y, y], color=FAINT, linewidth=1.2, zorder=1)
             ax.plot(value, y, "o", color=color, markersize=6, label=label if not row else None)
             ax.plot(paper, y, "|", color=color, markersize=9, markeredgewidth=1.6)

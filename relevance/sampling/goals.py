@@ -54,11 +54,11 @@ def sample_goals(
             if reference.name == subject.name or reference.on == subject.name:
                 continue
             goal = Goal(predicate=predicate, subject=subject.name, reference=reference.name)
-            if goal_holds(scene.objects, goal):
+            if goal_holds(scene.objects, goal, scene.robot):
                 continue
             goals.append(goal)
             weights.append(config.carrying_subject if subject.name in carrying else 1.0)
-            on_carrier.append(predicate is Predicate.ON and reference.name in carrying)
+            on_carrier.append(predicate.stacked and reference.name in carrying)
     weight = np.array(weights)
     chosen = np.array(on_carrier, dtype=bool)
     inside, outside = weight[chosen].sum(), weight[~chosen].sum()
@@ -66,5 +66,5 @@ def sample_goals(
         odds = config.carrying_reference / (1 - config.carrying_reference)
         weight[chosen] *= odds * outside / inside
     # Exponential keys: the order of a weighted draw without replacement.
-    keys = generator(seed, f"{scene.id}/{predicate.value}").exponential(size=len(goals)) / weight
+    keys = generator(seed, f"{scene.id}/{predicate.name}").exponential(size=len(goals)) / weight
     return tuple(goals[i] for i in np.argsort(keys, kind="stable")[:count])

@@ -199,7 +199,7 @@ class _Run:
     """One plan being judged."""
 
     def __init__(self, arena: _Arena, scene: Scene) -> None:
-        self.arena = arena
+        self.arena, self.robot = arena, scene.robot
         self.table = arena.enter(scene)
         self.boxes = {box.name: box for box in scene.objects}
         self.names = tuple(self.boxes)
@@ -367,7 +367,7 @@ class _Run:
     def _end(self, goal: Goal) -> None:
         if self.held is not None:
             raise _Refused(f"the plan ends with {self.held!r} in the hand")
-        if not goal_holds(self.boxes.values(), goal):
+        if not goal_holds(self.boxes.values(), goal, self.robot):
             raise _Refused(f"the goal {goal} is not true at the end")
 
     def _put(self, name: str, position: Sequence[float], orientation: Sequence[float]) -> None:

@@ -24,6 +24,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from relevance.errors import RelevanceError
 from relevance.store.places import is_remote
 
 TABLES = (
@@ -41,7 +42,7 @@ SCHEMAS = Path(__file__).parents[2] / "schemas"
 _BLANK = "0" * 64  # stands in the footer while the rest is hashed
 
 
-class DatasetError(ValueError):
+class DatasetError(RelevanceError):
     """A dataset that is not what it should be: file, column, expected and found in one line."""
 
 

@@ -34,6 +34,7 @@ from scipy.stats import rankdata
 from torch import Tensor
 from torch.nn import functional as F
 
+from relevance.errors import RelevanceError
 from relevance.hashing import content_hash
 from relevance.models import (
     GEOMETRY,
@@ -42,7 +43,7 @@ from relevance.models import (
     relevance_loss,
     vit_paper,
 )
-from relevance.scene import Predicate
+from relevance.scene import PREDICATES, Predicate
 from relevance.store import Dataset, DatasetError, replacing
 from relevance.training.examples import Batch, Examples, gather, in_the_mirror, load_examples
 
@@ -51,7 +52,7 @@ CHECKPOINT_VERSION = 1
 Progress = Callable[[int, int], None]
 
 
-class CheckpointError(ValueError):
+class CheckpointError(RelevanceError):
     """A file that is no checkpoint of this version: says which file, found and expected."""
 
 
@@ -165,7 +166,7 @@ class TrainConfig:
 
     def eta(self, predicate: Predicate) -> float:
         """The loss weight of relevant objects for this predicate."""
-        return self.eta_on if predicate is Predicate.ON else self.eta_same_plane
+        return self.eta_on if predicate.stacked else self.eta_same_plane
 
     @property
     def content_hash(self) -> str:
@@ -206,7 +207,7 @@ def draw_batch(examples: Examples, config: TrainConfig, step: int) -> Batch:
     groups = polling(list(examples.goals), share=config.share_encodings)
     predicates, visit = groups[step % len(groups)], step // len(groups)
     scenes = examples.scenes(predicates)
-    stream = list(Predicate).index(predicates[0])
+    stream = list(PREDICATES.values()).index(predicates[0])
     wanted = np.arange(visit * config.scenes_per_batch, (visit + 1) * config.scenes_per_batch)
     epochs, places = np.divmod(wanted, len(scenes))
     orders = {
@@ -528,7 +529,7 @@ def measure(model: RelevanceModel, examples: Examples, batch: int = 16) -> dict[
                 asked = torch.arange(score.shape[-1])[:, None] != goals[..., None, :]
                 arrays = (score, relevant, labelled, asked.all(-1))
                 rows = tuple(array.flatten(0, 1).numpy() for array in arrays)
-                for name in {predicate.value, predicate.family}:
+                for name in {predicate.name, predicate.family}:
                     pooled.setdefault(name, []).append(rows)
     return {name: _metrics(parts) for name, parts in sorted(pooled.items())}
 

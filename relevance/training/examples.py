@@ -21,14 +21,8 @@ import torch
 from torch import Tensor
 
 from relevance.models import DECIMETRE, GEOMETRY, PATCH, STRIDE, half_extents, mirrored
-from relevance.scene import Camera, Predicate, Scene
+from relevance.scene import PREDICATES, Camera, Predicate, Scene
 from relevance.store import Dataset, DatasetError
-
-MIRRORED = {
-    Predicate.ON_THE_LEFT: Predicate.ON_THE_RIGHT,
-    Predicate.ON_THE_RIGHT: Predicate.ON_THE_LEFT,
-}
-"""What a predicate becomes in the mirror; the others stay."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -144,14 +138,14 @@ def load_examples(
             index = [place[query] for query in queries]
             relevant[index], labelled[index] = answers, True
             pair = [place[subject], place[reference]]
-            found.setdefault(Predicate(predicate), []).append((done, pair, relevant, labelled))
+            found.setdefault(PREDICATES[predicate], []).append((done, pair, relevant, labelled))
         done += 1
     if labels:
         raise DatasetError(
             f"{dataset.path}: labels of split {split} name scene {min(labels)}, "
             "which no image shard holds"
         )
-    goals = {p: _goals(found[p], total) for p in Predicate if p in found}
+    goals = {p: _goals(found[p], total) for p in PREDICATES.values() if p in found}
     return Examples(
         images=images,
         views=views,
@@ -233,5 +227,5 @@ def in_the_mirror(batch: Batch) -> Batch:
         image=batch.image.flip(-1),
         cells=batch.cells.flip(-1),
         geometry=mirrored(batch.geometry),
-        turns=tuple((MIRRORED.get(turn[0], turn[0]), *turn[1:]) for turn in batch.turns),
+        turns=tuple((PREDICATES[turn[0].mirror], *turn[1:]) for turn in batch.turns),
     )

@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from relevance.errors import RelevanceError
 from relevance.planner.kinematics import ARM, HOME, LINKS, panda
 from relevance.planner.path import SPEED, STEP
 from relevance.planner.problem import Counts, Seconds
@@ -41,12 +42,10 @@ from relevance.scene import (
     Goal,
     Phase,
     Pose,
-    Predicate,
     Scene,
     SceneError,
     footprint_gap,
     goal_holds,
-    region,
 )
 
 ROUND = 0.01
@@ -110,7 +109,7 @@ DecisionRule place_straightOn {
 """
 
 
-class PeerError(ValueError):
+class PeerError(RelevanceError):
     """The other planner cannot run here: says what is missing and how to get it."""
 
 
@@ -173,7 +172,7 @@ def plan_rai(
     everything = frozenset(scene.names if movable is None else movable)
     for name in everything - set(scene.names):
         raise SceneError(f"movable: no object {name!r}, expected some of {', '.join(scene.names)}")
-    if goal_holds(scene.objects, goal):
+    if goal_holds(scene.objects, goal, scene.robot):
         return PlanResult(
             goal=goal, status="solved", final={}, cost=0.0, counts=Counts(), seconds=Seconds()
         )
@@ -353,7 +352,7 @@ def _acceleration(q: np.ndarray) -> float:
 def rai_problem(scene: Scene, goal: Goal, *, movable: Collection[str]) -> RaiProblem:
     """Write a goal in rai's formats; boxes outside `movable` stay where they are."""
     ids = {box.name: f"box{i}" for i, box in enumerate(scene.objects)}
-    on = goal.predicate is Predicate.ON
+    on = goal.predicate.stacked
     parts, lines = _hand()
     lines = [*_world(scene, "is_table, clear" if on else "is_table, clear, is_base"), *lines]
     turn = {box.name: math.pi / 2 if box.size[0] < box.size[1] else 0.0 for box in scene.objects}
@@ -479,20 +478,18 @@ def _box(
 
 def _target(scene: Scene, goal: Goal, reference_id: str, turn: Mapping[str, float]) -> str:
     """The goal region as a thin plate in its support; the subject's centre must be over it."""
-    u, thick = goal.predicate.direction, 0.002
+    thick, angle = 0.002, 0.0
     reference = scene[goal.reference]
-    if u is None:
+    if goal.predicate.stacked:
         x, y, z = reference.size
         extent = np.array([y, x] if turn[reference.name] else [x, y]) - 2 * REGION_MARGIN
         parent, centre = reference_id, (0.0, 0.0, (z - thick) / 2)
     else:
-        low, high, half = region(scene[goal.subject], reference, goal.predicate)
-        middle, depth = (low + high) / 2, high - low
-        extent = np.array([depth, 2 * half] if u[0] else [2 * half, depth]) - 2 * REGION_MARGIN
-        x, y = reference.position[0] + middle * u[0], reference.position[1] + middle * u[1]
-        parent, centre = "table", (x, y, 0.05 - thick / 2)
+        there = goal.predicate.region(scene[goal.subject], reference, scene.robot)
+        extent = 2 * np.array(there.half) - 2 * REGION_MARGIN
+        parent, centre, angle = "table", (there.x, there.y, 0.05 - thick / 2), there.angle
     size = (*np.maximum(extent, 2 * REGION_MARGIN), thick)
-    return f"target ({parent}): {_shape(centre, size, 0.0005, logical='{ is_target }')}"
+    return f"target ({parent}): {_shape(centre, size, 0.0005, yaw=angle, logical='{ is_target }')}"
 
 
 def _shape(centre, size, radius: float, *, yaw: float = 0.0, logical: str = "") -> str:

@@ -1,0 +1,173 @@
+"""What stands on the table and around it: boxes, table, camera, light, robot.
+
+Pydantic dataclasses: fields that are unknown, of another type, NaN or infinite are refused.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from relevance.errors import RelevanceError
+
+
+class SceneError(RelevanceError):
+    """A scene or goal that cannot be: says which field, what it holds, what was expected."""
+
+
+CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False)
+"""How the fields of a scene are checked."""
+
+Length = Annotated[float, Field(gt=0)]
+Unit = Annotated[float, Field(ge=0, le=1)]
+Vector = tuple[float, float, float]
+Color = tuple[Unit, Unit, Unit]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+class Box:
+    """One box, standing upright."""
+
+    name: Annotated[str, Field(min_length=1, pattern=r"^[^(),\s][^(),]*$")]
+    size: tuple[Length, Length, Length]
+    """Full edge lengths along its own x, y, z, m."""
+    position: Vector
+    """Centre in the world frame, m."""
+    yaw: float = 0.0
+    """Rotation about z, rad."""
+    color: Color
+    """RGB in 0..1, as in an image file."""
+    on: str | None = None
+    """Name of the box that it stands on; None for the table."""
+
+    @property
+    def bottom(self) -> float:
+        """Height of its lower face, m."""
+        return self.position[2] - self.size[2] / 2
+
+    @property
+    def top(self) -> float:
+        """Height of its upper face, m."""
+        return self.position[2] + self.size[2] / 2
+
+    @property
+    def extents(self) -> tuple[float, float]:
+        """Half extents of the footprint along world x and y, m."""
+        return self.extents_at(0.0)
+
+    def extents_at(self, angle: float) -> tuple[float, float]:
+        """Half extents of the footprint along axes that are turned by `angle` (rad), m."""
+        c, s = abs(math.cos(self.yaw - angle)), abs(math.sin(self.yaw - angle))
+        hx, hy = self.size[0] / 2, self.size[1] / 2
+        return c * hx + s * hy, s * hx + c * hy
+
+    def corners(self) -> np.ndarray:
+        """Footprint corners in the world frame, (4, 2), m."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        (hx, hy), (x, y) = (edge / 2 for edge in self.size[:2]), self.position[:2]
+        a, b, d, e = c * hx, s * hy, s * hx, c * hy
+        return np.array(
+            [
+                [x + a - b, y + d + e],
+                [x - a - b, y - d + e],
+                [x - a + b, y - d - e],
+                [x + a + b, y + d - e],
+            ]
+        )
+
+    def covers(self, x: float, y: float) -> bool:
+        """Whether the point (x, y) lies over its footprint."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        dx, dy = x - self.position[0], y - self.position[1]
+        return abs(c * dx + s * dy) <= self.size[0] / 2 and abs(c * dy - s * dx) <= self.size[1] / 2
+
+
+TEXTURES = ("checks", "stripes", "noise")
+"""Patterns that a table can have: squares, bands across its angle, cloudy spots."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+class Texture:
+    """A pattern on the table: parameters, not pixels, so that it can be drawn again exactly."""
+
+    kind: Literal["checks", "stripes", "noise"]
+    color: Color
+    """The second colour; the first is the table's own."""
+    scale: Length
+    """Edge of a square, width of a band or size of a spot, m."""
+    angle: float = 0.0
+    """Turn of the pattern about z, rad."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    """Where the pattern lies; which one it is, for `noise`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+class Table:
+    """The table, its top face at z = 0."""
+
+    size: tuple[Length, Length] = (0.8, 1.2)
+    """Full edge lengths along x and y, m."""
+    color: Color = (0.93, 0.92, 0.89)
+    texture: Texture | None = None
+    """None: of one colour."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+class Camera:
+    """Pinhole camera; image-left is robot-left."""
+
+    eye: Vector = (-0.66, 0.0, 0.66)
+    target: Vector = (0.0, 0.0, 0.0)
+    width: Annotated[int, Field(gt=0)] = 320
+    height: Annotated[int, Field(gt=0)] = 192
+    fov: Annotated[float, Field(gt=0, lt=180)] = 47.0
+    """Horizontal field of view, degrees."""
+    near: Length = 0.038
+    far: Length = 100.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+class Light:
+    """One distant light, as pybullet's TinyRenderer takes it."""
+
+    direction: Vector = (-0.4, 0.5, 1.0)
+    """From the scene towards the light."""
+    color: Color = (1.0, 1.0, 1.0)
+    distance: Length = 2.0
+    """How far the light is from the world's origin, m; shadows spread from there, while the
+    shade of a face depends on the direction alone."""
+    ambient: Unit = 0.6
+    diffuse: Unit = 0.4
+    specular: Unit = 0.05
+    shadow: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+class Robot:
+    """Where the Franka Panda stands."""
+
+    base: Vector = (-0.48, 0.0, 0.0)
+    yaw: float = 0.0
+
+
+def footprint_gap(a: Box, b: Box) -> float:
+    """Separating-axis distance of two footprints, m; negative where they overlap.
+
+    A lower bound of the true distance when positive, the exact depth when negative.
+    """
+    dx, dy = b.position[0] - a.position[0], b.position[1] - a.position[1]
+    c, s = abs(math.cos(b.yaw - a.yaw)), abs(math.sin(b.yaw - a.yaw))
+    best = -math.inf
+    for one, other in ((a, b), (b, a)):
+        along, across = math.cos(one.yaw), math.sin(one.yaw)
+        hx, hy = other.size[0] / 2, other.size[1] / 2
+        best = max(
+            best,
+            abs(along * dx + across * dy) - one.size[0] / 2 - c * hx - s * hy,
+            abs(along * dy - across * dx) - one.size[1] / 2 - s * hx - c * hy,
+        )
+    return best
