@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from relevance.cli import main
-from relevance.planner import Guide, peer
+from relevance.planner import Guide
+from relevance.planner.rai import planner as peer
 from relevance.planner.rai.planner import PeerError, RaiConfig, plan_rai, rai_problem
 from relevance.scene import Box, Scene, SceneError, goal_holds, scene_to_json
 from relevance.simulation import replay

@@ -147,7 +147,7 @@ def test_a_predicate_without_labels_is_left_out(root: Path) -> None:
     shutil.rmtree(root / "labels/predicate=behind")
     examples = load_examples(Dataset.open(root), "train", camera=Camera())
     steps = [draw_batch(examples, replace(CONFIG, mirror=False), s).turns for s in range(2)]
-    names = [turn[0].value for turns in steps for turn in turns]
+    names = [turn[0].name for turns in steps for turn in turns]
     assert names == ["on-the-left", "on-the-right", "in-front", "on"]
 
 
@@ -250,7 +250,7 @@ def test_the_mirror_shows_the_mirrored_scene(made: Path, examples: Examples) -> 
     expected = true_geometry(replace(sample.scene, id="", goals=(), objects=boxes))
     np.testing.assert_allclose(flipped.geometry[0].numpy(), expected, atol=1e-5)
     assert np.array_equal(flipped.image[0].permute(1, 2, 0).numpy(), sample.image[:, ::-1])
-    names = [turn[0].value for turn in flipped.turns]
+    names = [turn[0].name for turn in flipped.turns]
     assert names == ["on-the-right", "on-the-left", "in-front", "behind"]
     assert torch.equal(flipped.turns[0][2], batch.turns[0][2])
     assert torch.equal(in_the_mirror(flipped).geometry, batch.geometry)

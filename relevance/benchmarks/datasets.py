@@ -92,7 +92,7 @@ def measure_making(
             stages = {
                 "sums": (_add_up, [10_000_000] * 16),
                 "scenes": (_make, [(*job, None) for job in first]),
-                "goals": (_make, [(*job, p.value) for job in second for p in job[2].predicates]),
+                "goals": (_make, [(*job, p.name) for job in second for p in job[2].predicates]),
             }
             for stage, (work, jobs) in stages.items():
                 start = time.perf_counter()
