@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pybullet
 import pytest
+from relevance.simulation.textures import pattern
 
 from relevance.sampling import Randomisation, SceneConfig, sample_scene
 from relevance.scene import (
@@ -26,7 +27,6 @@ from relevance.scene import (
     scene_to_json,
 )
 from relevance.simulation import Renderer, Rendering, rejects
-from relevance.simulation.textures import pattern
 
 SCENE = Scene(
     objects=(

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from relevance.sampling.rows import covers, gap
 
 from relevance.planner import plan
 from relevance.sampling import (
@@ -33,7 +34,6 @@ from relevance.sampling import (
     sample_scene,
     vertices,
 )
-from relevance.sampling.rows import covers, gap
 from relevance.scene import (
     PREDICATES,
     Box,

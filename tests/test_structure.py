@@ -37,7 +37,7 @@ ANYTHING = ("relevance", "cli")
 DOORS = {
     "pybullet": ("simulation",),
     "casadi": ("planner",),
-    "numba": ("sampling", "simulation", "planner"),
+    "numba": ("scene", "sampling", "simulation", "planner"),
     "pyarrow": ("store",),
     "duckdb": ("store",),
     "webdataset": ("store",),
