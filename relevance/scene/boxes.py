@@ -64,8 +64,8 @@ class Box:
     """Full edge lengths along its own x, y, z, m."""
     position: Vector
     """Centre in the world frame, m."""
-    yaw: Turn = 0.0
-    """Rotation about z, rad; any turn is taken and kept in (-pi, pi]."""
+    yaw: Angle = 0.0
+    """Rotation about z, rad; a scene keeps it in (-pi, pi]."""
     color: Color
     """RGB in 0..1, as in an image file."""
     on: Support = None

@@ -11,7 +11,7 @@ from pydantic import Field, TypeAdapter, model_validator
 from pydantic.dataclasses import dataclass
 
 from relevance.hashing import content_hash
-from relevance.scene.boxes import CHECKED, Box, Camera, Light, Robot, SceneError, Table
+from relevance.scene.boxes import CHECKED, Box, Camera, Light, Robot, SceneError, Table, wrapped
 from relevance.scene.contacts import check_boxes
 from relevance.scene.plans import Pose
 from relevance.scene.predicates import Goal
@@ -39,6 +39,13 @@ class Scene:
 
     @model_validator(mode="after")
     def _possible(self) -> Scene:
+        # However turns are written, equal scenes are one; planners would break ties differently.
+        turns = [wrapped(box.yaw) for box in self.objects]
+        if turns != [box.yaw for box in self.objects]:
+            pairs = zip(self.objects, turns, strict=True)
+            object.__setattr__(
+                self, "objects", tuple(replace(box, yaw=turn) for box, turn in pairs)
+            )
         check_boxes(self.objects, self.table, self.robot)
         _check_camera(self.camera, self.objects)
         object.__setattr__(self, "goals", tuple(str(self.goal(text)) for text in self.goals))
