@@ -32,7 +32,7 @@ _FOOT = (
     0.008,
 )  # fmt: skip
 _TURNS = np.arange(16) * math.tau / 16
-_COLUMN = (0.054 * np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=1), 0.0, 0.385)
+_COLUMN = (0.054 * np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=1), 0.0, 0.205)
 ROBOT_RADIUS = 0.16
 """Around the base's axis, m: no box farther than this touches the foot of the robot."""
 _SLAB = 0.1  # how thick the table is taken to be, m
@@ -89,7 +89,7 @@ def _check_standing(where: str, box: Box, by_name: dict[str, Box]) -> None:
     for name in box.supports:
         if name == box.name or name not in by_name:
             raise SceneError(
-                f"{where}: on = {name!r}, expected null or names of other objects that carry it"
+                f"{where}: on = {name!r}, expected null or another object's name, or a list"
             )
     below = [by_name[name] for name in box.supports]
     for support in below or [None]:
