@@ -224,6 +224,43 @@ def test_crowding_puts_boxes_into_goal_regions():
     assert taken(1.0) > 0.4
 
 
+TURNED = Robot(base=(0.1, -0.7, 0.0), yaw=1.3)
+
+
+def test_crowding_follows_a_turned_robot():
+    """A goal's direction is the robot's: boxes stand in the regions of the robot at its place."""
+
+    def taken(robot: Robot) -> float:
+        hits = []
+        for scene in drawn:
+            for reference, predicate in itertools.product(scene.objects, SAME_PLANE):
+                probe = replace(reference, size=(0.05, 0.05, 0.05))
+                there = predicate.region(probe, reference, robot)
+                others = [box for box in scene.objects if box is not reference]
+                hits.append(any(box.covers(there.x, there.y) for box in others))
+        return float(np.mean(hits))
+
+    drawn = draw(40, robot=TURNED, table=Table(size=(1.2, 0.8)), min_objects=4, max_objects=6)
+    assert len(drawn) > 30
+    assert taken(TURNED) > 0.4
+    for scene in drawn[:10]:
+        for predicate in SAME_PLANE:
+            for goal in sample_goals(scene, predicate, 3, seed=0):
+                assert not goal_holds(scene.objects, goal, TURNED)
+
+
+def test_no_box_is_drawn_into_the_robot():
+    """However near boxes may stand; what is drawn is a scene, not an error."""
+    base = Robot(base=(-0.1, 0.0, 0.0))
+    drawn = draw(20, robot=base, reach=(0.0, 0.4), max_objects=4)
+    assert len(drawn) > 15
+
+
+def test_a_robot_in_the_table_is_named():
+    with pytest.raises(ValueError, match=r"SceneConfig: robot: base .* is in the table"):
+        SceneConfig(robot=Robot(base=(0.2, 0.0, -0.05)))
+
+
 def test_obstacles_are_too_wide_for_the_hand():
     wide = [
         min(box.size[:2]) > GRASPABLE_EDGE
@@ -262,6 +299,9 @@ def test_impossible_draws_fail_quietly():
         ("table_margin", -1.0),
         ("color_distance", 0.9),
         ("tries", 0),
+        ("camera", Camera(target=(-2, 0, 1))),
+        ("camera", Camera(far=0.3)),
+        ("camera", Camera(near=3.0)),
     ],
 )
 def test_bad_settings_are_named(field, value):

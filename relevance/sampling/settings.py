@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from relevance.configs import config
 from relevance.hashing import content_hash
 from relevance.sampling.colors import MOST
-from relevance.scene import FAMILIES, Camera, Light, Robot, Table
+from relevance.scene import FAMILIES, Camera, Light, Robot, Table, pinhole
+from relevance.scene.contacts import check_robot
 
 SAMPLER_VERSION = "1"
 """Raised when equal settings and counters come to give another scene or other goals: a default,
@@ -141,7 +143,24 @@ class SceneConfig:
         require("max_objects", self.min_objects <= self.max_objects, "at least min_objects")
         require("max_height", self.min_edge <= self.max_height, "at least min_edge")
         require("stack_height", 2 * self.min_edge < self.stack_height, "over twice min_edge")
+        check_robot(self.table, self.robot)
+        require("camera", self._in_sight(), "one that sees some of what the robot reaches")
         return self
+
+    def _in_sight(self) -> bool:
+        """Whether the camera sees any of the places where boxes may stand, 5 cm apart."""
+        edges = (np.arange(-edge / 2, edge / 2, 0.05) + 0.025 for edge in self.table.size)
+        x, y = (places.ravel() for places in np.meshgrid(*edges))
+        distance = np.hypot(x - self.robot.base[0], y - self.robot.base[1])
+        within = (self.reach[0] <= distance) & (distance <= self.reach[1])
+        points = np.stack([x, y, np.full(len(x), self.min_edge / 2)], axis=1)[within]
+        eye, axes, focal = pinhole(self.camera)
+        right, down, depth = ((points - eye) @ axes).T
+        half = np.array([self.camera.width, self.camera.height]) / 2 / focal
+        ahead = (depth > self.camera.near) & (depth < self.camera.far)
+        return bool(
+            (ahead & (abs(right) <= half[0] * depth) & (abs(down) <= half[1] * depth)).any()
+        )
 
     @property
     def content_hash(self) -> str:

@@ -50,6 +50,7 @@ class _Limits(NamedTuple):
     height: float
     image_margin: float
     near: float
+    far: float
     visible: float
 
 
@@ -84,6 +85,7 @@ class Standing:
             camera.height,
             config.image_margin,
             camera.near,
+            camera.far,
             config.visible,
         )
         self._limits = _Limits(*map(float, limits))  # one type of number: compiled once
@@ -146,7 +148,7 @@ def _seen(box, limits, eye, axes, focal, bounds):
     """Whether the box is wholly in the picture; fills its bounds there (4,), px."""
     points = projected(corners(box), eye, axes, focal)
     for k in range(8):
-        if points[k, 2] <= limits.near:
+        if not limits.near < points[k, 2] < limits.far:
             return False
     bound(points, bounds)
     x, y = limits.width / 2 - limits.image_margin, limits.height / 2 - limits.image_margin

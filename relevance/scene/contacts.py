@@ -65,6 +65,13 @@ def check_boxes(objects: Sequence[Box], table: Table, robot: Robot) -> None:
                 "expected a box clear of it"
             )
     _check_cycles(objects, by_name)
+    check_robot(table, robot)
+
+
+def check_robot(table: Table, robot: Robot) -> None:
+    """Raise SceneError when the robot stands in the table."""
+    if robot.base[2] >= -CONTACT_TOLERANCE:
+        return
     top = Box(name="top", size=(*table.size, _SLAB), position=(0, 0, -_SLAB / 2), color=(0, 0, 0))
     if robot_depth(top, robot) > CONTACT_TOLERANCE:
         raise SceneError(f"robot: base {list(robot.base)} is in the table, expected z at least 0")

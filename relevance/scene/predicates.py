@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass as plain_dataclass
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, InstanceOf, PlainSerializer
+from pydantic import AfterValidator, BeforeValidator, InstanceOf, PlainSerializer
 from pydantic.dataclasses import dataclass
 
 from relevance.registry import Registry
@@ -159,8 +159,8 @@ class Goal:
     predicate: Annotated[
         InstanceOf[Predicate], BeforeValidator(_named), PlainSerializer(str, return_type=str)
     ]
-    subject: str
-    reference: str
+    subject: Annotated[str, AfterValidator(normal)]
+    reference: Annotated[str, AfterValidator(normal)]
 
     def __str__(self) -> str:
         return f"{self.predicate}({self.subject}, {self.reference})"
