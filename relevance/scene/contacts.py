@@ -48,13 +48,16 @@ def check_boxes(objects: Sequence[Box], table: Table, robot: Robot) -> None:
                 "expected distinct names other than 'table'"
             )
         by_name[box.name] = box
+    radii = [math.hypot(*box.size[:2]) / 2 for box in objects]
     for i, box in enumerate(objects):
         where = f"objects.{i} ({box.name!r})"
         _check_on_table(where, box, table)
         _check_standing(where, box, by_name)
-        for other in objects[:i]:
+        for j, other in enumerate(objects[:i]):
+            if math.dist(box.position[:2], other.position[:2]) > radii[i] + radii[j]:
+                continue
             depth = -max(box.bottom - other.top, other.bottom - box.top, footprint_gap(box, other))
-            if depth > _tolerance(box, other):
+            if depth > 0 and depth > _tolerance(box, other):
                 raise SceneError(
                     f"{where}: overlaps {other.name!r} by {1000 * depth:.1f} mm, "
                     "expected boxes apart or touching"

@@ -72,19 +72,20 @@ class _NotJsonError(ValueError):
     """A text is no JSON value; the message says where and why."""
 
 
-class _Object(dict[str, Any]):
-    """A JSON object that knows whether a key was given twice."""
+class _Repeated(dict[str, Any]):
+    """A JSON object of which a key was given twice."""
 
-    twice: str | None = None
+    key = ""
 
 
-def _object(pairs: list[tuple[str, Any]]) -> _Object:
-    made = _Object()
-    for key, value in pairs:
-        if key in made:
-            made.twice = key
-        made[key] = value
-    return made
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    made = dict(pairs)
+    if len(made) == len(pairs):
+        return made
+    marked = _Repeated(made)
+    seen: set[str] = set()
+    marked.key = next(key for key, _ in pairs if key in seen or seen.add(key))
+    return marked
 
 
 def _json(text: str) -> Any:
@@ -140,17 +141,15 @@ def _scene(value: Any, where: str) -> Scene:
 
 
 def _check_keys(value: Any, where: str) -> None:
-    """Raise SceneError at the first key that is given twice, at whatever depth."""
+    """Raise SceneError at a key that is given twice, at whatever depth."""
     waiting: list[tuple[str, Any]] = [("", value)]
     while waiting:
         path, item = waiting.pop()
-        if isinstance(item, _Object):
-            if item.twice is not None:
-                key = printable(f"{path}{item.twice}")
-                raise SceneError(f"{where}: {key}: given twice, expected each key once")
-            waiting += [(f"{path}{key}.", part) for key, part in item.items()]
-        elif isinstance(item, list):
-            waiting += [(f"{path}{n}.", part) for n, part in enumerate(item)]
+        if isinstance(item, _Repeated):
+            key = printable(f"{path}{item.key}")
+            raise SceneError(f"{where}: {key}: given twice, expected each key once")
+        parts = item.items() if isinstance(item, dict) else enumerate(item)
+        waiting += [(f"{path}{k}.", part) for k, part in parts if isinstance(part, dict | list)]
 
 
 _SAID_BETTER = {
@@ -159,7 +158,7 @@ _SAID_BETTER = {
     "tuple_type": "expected a list",
 }
 _TRIED = ("function-after[", "tuple[", "str")
-_KINDS = {type(None): "null", list: "a list", _Object: "an object"}
+_KINDS = {type(None): "null", list: "a list"}
 
 
 def _kind(value: Any) -> str:
