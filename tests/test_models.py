@@ -24,8 +24,7 @@ from relevance.models import (
     vit_paper,
     vit_small,
 )
-from relevance.sampling import project
-from relevance.scene import PREDICATES, Box, Camera, Predicate, Robot
+from relevance.scene import PREDICATES, Box, Camera, Predicate, Robot, project
 
 torch.set_num_threads(1)  # threads that wait for each other crawl on a busy machine
 

@@ -14,13 +14,7 @@ from hypothesis import strategies as st
 from relevance import _kernel_cache
 from relevance.planner import keyframes, path, placement
 from relevance.planner.kernels import native
-from relevance.planner.kernels.boxes import (
-    UPRIGHT,
-    banded_solve,
-    rectangle_gap,
-    separation,
-    upright,
-)
+from relevance.planner.kernels.boxes import banded_solve, separation
 from relevance.planner.kernels.native import call
 from relevance.planner.kinematics import (
     ARM,
@@ -33,6 +27,7 @@ from relevance.planner.kinematics import (
 )
 from relevance.planner.placement import FOUND, NONE
 from relevance.scene import Box
+from relevance.scene.geometry import UPRIGHT, rectangle_gap, upright
 from relevance.simulation import panda_urdf
 
 BASE = np.array([-0.48, 0.0, 0.0, 0.0])

@@ -26,7 +26,7 @@ from relevance.scene import (
     scene_to_json,
 )
 from relevance.simulation import Renderer, Rendering, rejects
-from relevance.simulation.textures import pattern
+from relevance.simulation.painting import pattern
 
 SCENE = Scene(
     objects=(
@@ -293,6 +293,15 @@ def test_views_depend_on_size_and_color_alone(renderer):
     red = views[0][0][~grey[0]].astype(int)
     inner = red[(red[:, 0] > red[:, 1] + 30)]
     assert len(inner) > 0.7 * len(red)
+
+
+def test_views_are_taken_under_a_nominal_light(renderer):
+    """They are taken before anybody knows the scene; its own light would be a tell."""
+    scene = replace(SCENE, id="")
+    dim = replace(scene, light=Light(direction=(0.5, -0.6, 0.7), color=(0.9, 1, 0.8), ambient=0.4))
+    bright, dark = renderer.render(scene), renderer.render(dim)
+    assert (bright.views == dark.views).all()
+    assert (bright.image != dark.image).any()
 
 
 def test_the_largest_box_fits_its_view(renderer):

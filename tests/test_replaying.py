@@ -6,12 +6,15 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pybullet
 import pytest
 
+from relevance.planner import plan
 from relevance.scene import (
+    PREDICATES,
     Action,
     Box,
     Goal,
@@ -21,8 +24,12 @@ from relevance.scene import (
     Scene,
     SceneError,
     Table,
+    goal_holds,
+    read_scenes,
 )
 from relevance.simulation import panda_urdf, replay
+
+CASES = Path(__file__).parent / "cases"
 
 GRASP = 11  # the URDF's grasp target, between the finger pads
 REST = np.array([0.0, -0.3, 0.0, -2.2, 0.0, 2.0, 0.8])
@@ -192,6 +199,36 @@ def test_replay_from_a_turned_robot(arm, good):
     verdict = replay(scene, Goal.parse("on(red, blue)"), good)
     assert verdict.reason == "the goal on(red, blue) is not true at the end"
     assert verdict.max_penetration < 1e-4
+    assert replay(scene, GOAL, good).ok
+
+
+SIDES = {
+    "opposite": Robot(base=(0.48, 0.0, 0.0), yaw=math.pi),
+    "beside": Robot(base=(0.0, -0.5, 0.0), yaw=math.pi / 2),
+    "raised": Robot(base=(-0.45, 0.1, 0.1), yaw=-0.4),
+}
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("name", [p.name for p in PREDICATES.values() if not p.stacked])
+def test_plans_of_turned_robots_end_where_the_robot_says(side, name):
+    """A goal's direction is the robot's, to the planner and to the referee alike."""
+    robot = SIDES[side]
+    scene = replace(read_scenes(CASES / "other-side.jsonl")[0], id="", robot=robot)
+    goal = scene.goal(f"{name}(a, b)")
+    result = plan(scene, goal)
+    assert result.status == "solved"
+    verdict = replay(scene, goal, result.phases)
+    assert verdict.ok
+    assert verdict.reason == ""
+    a, b = (next(box for box in scene.moved(result.final) if box.name == n) for n in "ab")
+    dx, dy = a.position[0] - b.position[0], a.position[1] - b.position[1]
+    c, s = math.cos(robot.yaw), math.sin(robot.yaw)
+    ahead, left = c * dx + s * dy, c * dy - s * dx
+    toward = {"on-the-left": left, "on-the-right": -left, "behind": ahead, "in-front": -ahead}
+    assert max(toward, key=lambda way: toward[way]) == name
+    # What is left of one robot is not left of a robot that faces it.
+    assert not goal_holds([a, b], goal, replace(robot, yaw=robot.yaw + math.pi))
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from structure import (
 DOORS = {
     "pybullet": ("simulation",),
     "casadi": ("planner",),
-    "numba": ("sampling", "simulation", "planner"),
+    "numba": ("scene", "sampling", "simulation", "planner"),
     "pyarrow": ("store",),
     "duckdb": ("store",),
     "webdataset": ("store",),

@@ -62,7 +62,7 @@ def _leave(scene: Scene, order: Sequence[str]) -> bool:
     for name in order:
         box = scene[name]
         standing.remove(box)
-        if any(other.on == name for other in standing) or not _takes(scene, box, standing):
+        if any(name in other.supports for other in standing) or not _takes(scene, box, standing):
             return False
     return True
 

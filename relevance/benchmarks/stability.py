@@ -117,7 +117,7 @@ def jitter(scene: Scene, rng: np.random.Generator) -> Scene:
             shift[box.name] = JITTER * np.array([math.cos(angle), math.sin(angle)])
         boxes = []
         for box in scene.objects:
-            dx, dy = shift[box.name] + shift[box.on]
+            dx, dy = shift[box.name] + shift[next(iter(box.supports), None)]
             x, y, z = box.position
             boxes.append(replace(box, position=(x + float(dx), y + float(dy), z)))
         try:

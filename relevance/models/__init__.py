@@ -23,8 +23,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from relevance.sampling import camera_up
-from relevance.scene import PREDICATES, Camera, Predicate, Robot
+from relevance.scene import PREDICATES, Camera, Predicate, Robot, camera_up
 
 PATCH = 32
 """Edge of image patches and canonical views, pixels (the paper's)."""

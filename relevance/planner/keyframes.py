@@ -19,16 +19,15 @@ import numpy as np
 from numba import njit
 
 from relevance.planner.kernels.boxes import (
-    UPRIGHT,
     Bodies,
     body_pose,
     dense_solve,
     near,
     point_gradient,
     separation,
-    upright,
 )
 from relevance.planner.kinematics import ARM, FRAME, HAND, look_at_frames, look_at_grasp, panda
+from relevance.scene.geometry import UPRIGHT, upright
 
 CLEARANCE = 0.0025
 """Clearance asked of every pair at a switch, m (the pose bound's MARGIN is larger)."""

@@ -14,7 +14,8 @@ from relevance.scene import Action, Goal, Scene
 def stacked_on(scene: Scene) -> dict[str, frozenset[str]]:
     """For each object, the objects that stand directly on it."""
     return {
-        name: frozenset(box.name for box in scene.objects if box.on == name) for name in scene.names
+        name: frozenset(box.name for box in scene.objects if name in box.supports)
+        for name in scene.names
     }
 
 

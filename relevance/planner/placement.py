@@ -16,9 +16,9 @@ from functools import cache
 import numpy as np
 from numba import njit
 
-from relevance.planner.kernels.boxes import UPRIGHT, rectangle_gap, upright
 from relevance.planner.kinematics import panda
 from relevance.scene import Box
+from relevance.scene.geometry import UPRIGHT, rectangle_gap, upright
 
 MARGIN = 0.003
 """Clearance that placements keep, m; the later bounds ask for less, so they never refuse it."""

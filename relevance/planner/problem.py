@@ -15,7 +15,7 @@ from itertools import compress
 import numpy as np
 
 from relevance.planner import keyframes, logic, path, placement
-from relevance.planner.kernels.boxes import UPRIGHT, Bodies, upright
+from relevance.planner.kernels.boxes import Bodies
 from relevance.planner.kinematics import (
     ARM,
     HOME,
@@ -28,6 +28,7 @@ from relevance.planner.kinematics import (
 )
 from relevance.planner.placement import EDGE, FOUND, NONE, UNDECIDED, Grasp
 from relevance.scene import Box, Goal, Phase, Pose, Scene
+from relevance.scene.geometry import UPRIGHT, upright
 
 REGION_MARGIN = 0.0005
 """How far inside the goal region a subject is placed, m."""

@@ -14,31 +14,22 @@ the queries are relevant; in the paper 14% and 30%. All of it is configuration, 
 row's hash.
 """
 
-from relevance.sampling.colors import lab
-from relevance.sampling.fitting import GRASPABLE_EDGE
-from relevance.sampling.goals import GoalConfig, sample_goals
-from relevance.sampling.projection import camera_up, pinhole, project, vertices
-from relevance.sampling.randomisation import Randomisation
-from relevance.sampling.rows import bound, corners, crossing, extents, projected, row, rows
-from relevance.sampling.scenes import SceneConfig, sample_scene
+from relevance.sampling.goals import sample_goals
+from relevance.sampling.scenes import sample_scene
+from relevance.sampling.settings import (
+    GRASPABLE_EDGE,
+    SAMPLER_VERSION,
+    GoalConfig,
+    Randomisation,
+    SceneConfig,
+)
 
 __all__ = [
     "GRASPABLE_EDGE",
+    "SAMPLER_VERSION",
     "GoalConfig",
     "Randomisation",
     "SceneConfig",
-    "bound",
-    "camera_up",
-    "corners",
-    "crossing",
-    "extents",
-    "lab",
-    "pinhole",
-    "project",
-    "projected",
-    "row",
-    "rows",
     "sample_goals",
     "sample_scene",
-    "vertices",
 ]

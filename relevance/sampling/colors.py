@@ -6,19 +6,20 @@ by the light and writes the result.
 
 from __future__ import annotations
 
+import colorsys
 import math
 from operator import itemgetter
 
 import numpy as np
 
-Color = tuple[float, float, float]
+from relevance.scene import Color, lab
 
 FEW = 11
 """Up to this many boxes keep the full distance of colours."""
 MOST = 31
 """Most boxes in one scene."""
 
-COLOR_NAMES: dict[str, tuple[float, float, float]] = {
+COLOR_NAMES: dict[str, Color] = {
     "red": (0.85, 0.1, 0.1),
     "maroon": (0.45, 0.1, 0.12),
     "orange": (0.95, 0.5, 0.1),
@@ -86,26 +87,10 @@ def draw_colors(
     return None
 
 
-def lab(color: np.ndarray) -> np.ndarray:
-    """CIELAB (..., 3) of sRGB (..., 3) in 0..1, white point D65; distances in it are Delta E."""
-    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
-    relative = linear @ _TO_XYZ.T / _TO_XYZ.sum(axis=1)
-    f = np.where(relative > _KNEE**3, np.cbrt(relative), relative / (3 * _KNEE**2) + 4 / 29)
-    x, y, z = f[..., 0], f[..., 1], f[..., 2]
-    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
-
-
-_KNEE = 6 / 29
-_TO_XYZ = np.array(  # IEC 61966-2-1
-    [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-)
-
-
 def from_hsv(hue: float, saturation: float, value: float) -> Color:
     """RGB of a hue, saturation and value in 0..1, rounded to 0.001."""
     red, green, blue = (
-        round(1000 * (value * (1 - saturation * max(min(k, 4 - k, 1), 0)))) / 1000
-        for k in ((offset + 6 * hue) % 6 for offset in (5.0, 3.0, 1.0))
+        round(1000 * channel) / 1000 for channel in colorsys.hsv_to_rgb(hue, saturation, value)
     )
     return red, green, blue
 

@@ -2,31 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from relevance.counters import generator
-from relevance.sampling.fitting import GRASPABLE_EDGE
+from relevance.sampling.settings import GRASPABLE_EDGE, GoalConfig
 from relevance.scene import Goal, Predicate, Scene, goal_holds
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GoalConfig:
-    """The odds of goals; they look at who carries whom, never at plans."""
-
-    carrying_reference: float = 0.98
-    """Share of `on` goals whose reference carries a box already, where the scene has one."""
-    carrying_subject: float = 30.0
-    """How likely a box that carries another is drawn as subject, relative to one that does not."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.carrying_reference < 1:
-            found = self.carrying_reference
-            raise ValueError(f"GoalConfig.carrying_reference = {found!r}: expected in (0, 1)")
-        if not self.carrying_subject > 0:
-            found = self.carrying_subject
-            raise ValueError(f"GoalConfig.carrying_subject = {found!r}: expected over 0")
+_DEFAULT = GoalConfig()
 
 
 def sample_goals(
@@ -35,14 +17,14 @@ def sample_goals(
     count: int,
     *,
     seed: int,
-    config: GoalConfig = GoalConfig(),
+    config: GoalConfig = _DEFAULT,
 ) -> tuple[Goal, ...]:
     """Draw up to `count` distinct goals that are not true yet and whose subject can be grasped.
 
     Depends on (seed, scene.id, predicate, config) and the scene's boxes alone; asking for more
     goals keeps the earlier ones. Fewer than `count` come back when the scene has no more.
     """
-    carrying = {box.on for box in scene.objects if box.on is not None}
+    carrying = {name for box in scene.objects for name in box.supports}
     goals: list[Goal] = []
     weights: list[float] = []
     on_carrier: list[bool] = []
@@ -51,7 +33,7 @@ def sample_goals(
             continue
         for reference in scene.objects:
             # A reference that stands on its own subject would be lifted away with it.
-            if reference.name == subject.name or reference.on == subject.name:
+            if reference.name == subject.name or subject.name in reference.supports:
                 continue
             goal = Goal(predicate=predicate, subject=subject.name, reference=reference.name)
             if goal_holds(scene.objects, goal, scene.robot):

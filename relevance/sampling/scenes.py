@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from relevance.counters import generator
-from relevance.hashing import content_hash
-from relevance.sampling.colors import MOST, Color, draw_colors
-from relevance.sampling.fitting import GRASPABLE_EDGE, Standing
-from relevance.sampling.randomisation import (
-    Randomisation,
-    draw_camera,
-    draw_light,
-    draw_table,
-)
-from relevance.sampling.rows import row
-from relevance.scene import FAMILIES, GAP, Box, Camera, Light, Robot, Scene, Table
+from relevance.sampling.colors import draw_colors
+from relevance.sampling.looks import draw_camera, draw_light, draw_table
+from relevance.sampling.settings import GRASPABLE_EDGE, SceneConfig
+from relevance.sampling.standing import Standing
+from relevance.scene import GAP, Box, Color, Scene
+from relevance.scene.geometry import packed
 
 NEAR = 0.026
 """Narrowest gap of a crowded box to its neighbour, m. A finger beside a box takes 34 mm with its
@@ -27,111 +22,6 @@ CENTRED = 0.2
 """How far off a neighbour's middle a crowded box may stand, as a share of its half extent."""
 BROADSIDE = 0.15
 """How far a crowded box may be turned out of line with its neighbour's sides, rad."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SceneConfig:
-    """What scenes are drawn; raises ValueError that names the field on impossible settings."""
-
-    family: str = "same-plane"
-    """`same-plane`: all boxes on the table. `on`: one box more, and some on top of others."""
-    min_objects: int = 3
-    """Fewest boxes (the `on` family adds one)."""
-    max_objects: int = 10
-    """Most boxes (the `on` family adds one)."""
-    crowding: float = 1.0
-    """Probability that a box is drawn into a goal region of an earlier one (same-plane)."""
-    crowding_on: float = 0.0
-    """The same for the boxes on the table of an `on` scene."""
-    choices: int = 3
-    """Free places of which a crowded box takes the one that closes most goal regions."""
-    stacking: float = 0.7
-    """Probability that a box of an `on` scene stands on another (one always does; stacks are
-    two high, so at most every second box)."""
-    stack_height: float = 0.15
-    """Tallest stack, m; taller ones hide what is behind them."""
-    obstacle_share: float = 0.0
-    """Share of boxes with both footprint edges over 7 cm, which the hand cannot take."""
-    min_edge: float = 0.04
-    """Shortest edge, m."""
-    max_edge: float = 0.12
-    """Longest edge, m."""
-    max_height: float = 0.12
-    """Tallest box, m."""
-    spacing: float = 0.005
-    """Least distance between boxes, m."""
-    reach: tuple[float, float] = (0.30, 0.72)
-    """Distance of a box's centre from the robot's base, from and to, m."""
-    table_margin: float = 0.02
-    """Least distance of a footprint from the table's edge, m."""
-    image_margin: float = 2.0
-    """Least distance of a box's projection from the image border, pixels."""
-    visible: float = 0.35
-    """Least share of what the camera sees of a box alone that shows among the others, judged by
-    rays to its faces; the rendering has the last word."""
-    color_distance: float = 0.3
-    """Least RGB distance of two boxes, and of a box and the table; with n > 11 boxes it
-    shrinks by (11 / n)^(1/2)."""
-    tries: int = 100
-    """Positions tried for one box before the draw counts as failed."""
-    randomisation: Randomisation | None = None
-    """Light, table, camera and colours that differ from scene to scene; None: the paper's
-    setting, all as below."""
-    table: Table = field(default_factory=Table)
-    camera: Camera = field(default_factory=Camera)
-    light: Light = field(default_factory=Light)
-    robot: Robot = field(default_factory=Robot)
-
-    def __post_init__(self) -> None:
-        def require(name: str, good: bool, expected: str) -> None:
-            if not good:
-                value = getattr(self, name)
-                raise ValueError(f"SceneConfig.{name} = {value!r}: expected {expected}")
-
-        require("family", self.family in FAMILIES, f"one of {', '.join(FAMILIES)}")
-        require("min_objects", self.min_objects >= 2, "at least 2")
-        require("max_objects", self.min_objects <= self.max_objects, "at least min_objects")
-        require("max_objects", self.max_objects < MOST, f"under {MOST} (distinct colours)")
-        require("crowding", 0 <= self.crowding <= 1, "a probability")
-        require("crowding_on", 0 <= self.crowding_on <= 1, "a probability")
-        require("choices", self.choices >= 1, "at least 1")
-        require("stacking", 0 <= self.stacking <= 1, "a probability")
-        require("obstacle_share", 0 <= self.obstacle_share <= 1, "a probability")
-        require("min_edge", 0 < self.min_edge <= GRASPABLE_EDGE, f"in (0, {GRASPABLE_EDGE}]")
-        require("max_edge", self.max_edge > GRASPABLE_EDGE, f"over {GRASPABLE_EDGE}")
-        require("max_height", self.min_edge <= self.max_height, "at least min_edge")
-        require("stack_height", 2 * self.min_edge < self.stack_height, "over twice min_edge")
-        require("spacing", self.spacing >= 0, "at least 0")
-        require("reach", 0 <= self.reach[0] < self.reach[1], "0 <= from < to")
-        require("table_margin", self.table_margin >= 0, "at least 0")
-        require("visible", 0 <= self.visible < 1, "in [0, 1)")
-        require("color_distance", 0 < self.color_distance <= 0.35, "in (0, 0.35]")
-        require("tries", self.tries >= 1, "at least 1")
-
-    @property
-    def content_hash(self) -> str:
-        """16 hex digits that depend on the settings alone."""
-        return content_hash(self)
-
-    @classmethod
-    def crowded(cls, n: int, family: str = "same-plane") -> SceneConfig:
-        """Scenes of exactly n boxes, 2 to 30, to see how planning time grows with their number.
-
-        The boxes are slimmer and lower than elsewhere, so that 30 of them stand on the same
-        table, all in sight; for fewer the settings are the same, so that only n differs.
-        """
-        extra = int(family == "on")
-        return cls(
-            family=family,
-            min_objects=n - extra,
-            max_objects=n - extra,
-            max_edge=0.075,
-            max_height=0.06,
-            stack_height=0.12,
-            crowding=0.8,
-            visible=0.3,
-            tries=300,
-        )
 
 
 def sample_scene(
@@ -224,7 +114,7 @@ def _table_box(
         else:
             x, y, yaw = _anywhere(rng, config)
         position, yaw = (round(x, 4), round(y, 4), size[2] / 2), round(yaw, 4)
-        candidate = np.array(row(size, position, yaw))
+        candidate = packed(size, position, yaw)
         if standing.admits(candidate):
             closed = standing.closes(candidate)
             if closed > most:
@@ -268,17 +158,19 @@ def _beside(
     axis = quarter % 2
     broadside = 0.0 if (size[0] < size[1]) == (axis == 0) else math.pi / 2
     turn, deep, off = rng.random(3).tolist()
-    yaw = broadside + _within(-BROADSIDE, BROADSIDE, turn)
+    yaw = broadside + _within(-BROADSIDE, BROADSIDE, turn)  # to the robot's axes
     c, s = abs(math.cos(yaw)), abs(math.sin(yaw))
     extents = (c * size[0] + s * size[1]) / 2, (s * size[0] + c * size[1]) / 2
     gap = max(config.spacing, _within(NEAR, GAP, deep))
-    there = neighbour.extents
+    there = neighbour.extents_at(config.robot.yaw)
     along = there[axis] + extents[axis] + gap
     across = _within(-CENTRED, CENTRED, off) * there[1 - axis]
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
-    x = neighbour.position[0] + along * c - across * s
-    y = neighbour.position[1] + along * s + across * c
-    return x, y, yaw
+    dx, dy = along * c - across * s, along * s + across * c
+    c, s = math.cos(config.robot.yaw), math.sin(config.robot.yaw)
+    x = neighbour.position[0] + (c * dx - s * dy)
+    y = neighbour.position[1] + (s * dx + c * dy)
+    return x, y, yaw + config.robot.yaw
 
 
 def _stacked_box(
@@ -311,7 +203,7 @@ def _stacked_box(
             carrier.top + size[2] / 2,
         )
         yaw = round(yaw, 4)
-        if standing.admits(np.array(row(size, position, yaw)), i):
+        if standing.admits(packed(size, position, yaw), i):
             return Box(
                 name=name, size=size, position=position, yaw=yaw, color=color, on=carrier.name
             )

@@ -2,8 +2,11 @@
 
 World frame: origin at the centre of the table's top face, x forward (away from the
 robot), y to the robot's left, z up. SI units (m, rad) throughout. A scene that exists is a
-scene that was checked: unknown fields, NaN, overlapping, floating and off-table boxes are
-refused with the field's name.
+scene that was checked: unknown fields, NaN, overlapping, floating and off-table boxes, and boxes
+in the robot are refused with the field's name. Directions are the robot's.
+
+Compiled loops over boxes are in `relevance.scene.geometry`, imported by that name alone: reading
+a scene loads no compiler.
 """
 
 from relevance.scene.boxes import (
@@ -18,6 +21,8 @@ from relevance.scene.boxes import (
     Texture,
     footprint_gap,
 )
+from relevance.scene.contacts import CONTACT_TOLERANCE
+from relevance.scene.looks import lab, lookalikes
 from relevance.scene.plans import Action, Phase, Pose
 from relevance.scene.predicates import (
     FAMILIES,
@@ -28,13 +33,9 @@ from relevance.scene.predicates import (
     Rectangle,
     goal_holds,
 )
-from relevance.scene.scenes import (
-    CONTACT_TOLERANCE,
-    Scene,
-    read_scenes,
-    scene_from_json,
-    scene_to_json,
-)
+from relevance.scene.projection import camera_up, pinhole, project, vertices
+from relevance.scene.reading import read_scenes, scene_from_json, scene_to_json
+from relevance.scene.scenes import Scene
 
 __all__ = [
     "CONTACT_TOLERANCE",
@@ -57,9 +58,15 @@ __all__ = [
     "SceneError",
     "Table",
     "Texture",
+    "camera_up",
     "footprint_gap",
     "goal_holds",
+    "lab",
+    "lookalikes",
+    "pinhole",
+    "project",
     "read_scenes",
     "scene_from_json",
     "scene_to_json",
+    "vertices",
 ]

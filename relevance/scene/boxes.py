@@ -6,13 +6,14 @@ Pydantic dataclasses: fields that are unknown, of another type, NaN or infinite 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Strict, model_validator
 from pydantic.dataclasses import dataclass
 
 from relevance.errors import RelevanceError
+from relevance.scene.words import Name
 
 
 class SceneError(RelevanceError):
@@ -22,27 +23,60 @@ class SceneError(RelevanceError):
 CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False)
 """How the fields of a scene are checked."""
 
-Length = Annotated[float, Field(gt=0)]
-Unit = Annotated[float, Field(ge=0, le=1)]
-Vector = tuple[float, float, float]
+_FAR = 1e6  # m; beyond, and for far more turns than this, digits are lost
+
+Length = Annotated[float, Strict(), Field(gt=0, le=_FAR)]
+Unit = Annotated[float, Strict(), Field(ge=0, le=1)]
+Metres = Annotated[float, Strict(), Field(ge=-_FAR, le=_FAR)]
+Angle = Annotated[float, Strict(), Field(ge=-_FAR, le=_FAR)]
+Whole = Annotated[int, Strict()]
+Vector = tuple[Metres, Metres, Metres]
 Color = tuple[Unit, Unit, Unit]
+
+
+def wrapped(angle: float) -> float:
+    """The same turn in (-pi, pi], rad; to 1e-12, so that all ways to write it are one."""
+    turn = round(math.remainder(angle, math.tau), 12)
+    return math.pi if abs(turn) > math.pi else turn
+
+
+Turn = Annotated[Angle, AfterValidator(wrapped)]
+
+
+def _supports(value: Any) -> Any:
+    """One name instead of a list of one; what is no name is refused later, by its type."""
+    if not isinstance(value, list | tuple):
+        return value
+    if not value or len(set(map(str, value))) < len(value):
+        raise ValueError("expected null, a name or a list of distinct names")
+    return value[0] if len(value) == 1 else tuple(value)
+
+
+Support = Annotated[Name | tuple[Name, ...] | None, BeforeValidator(_supports)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
 class Box:
     """One box, standing upright."""
 
-    name: Annotated[str, Field(min_length=1, pattern=r"^[^(),\s][^(),]*$")]
+    name: Name
     size: tuple[Length, Length, Length]
     """Full edge lengths along its own x, y, z, m."""
     position: Vector
     """Centre in the world frame, m."""
-    yaw: float = 0.0
-    """Rotation about z, rad."""
+    yaw: Angle = 0.0
+    """Rotation about z, rad; a scene keeps it in (-pi, pi]."""
     color: Color
     """RGB in 0..1, as in an image file."""
-    on: str | None = None
-    """Name of the box that it stands on; None for the table."""
+    on: Support = None
+    """Name of the box that it stands on, or names of several; None for the table."""
+
+    @property
+    def supports(self) -> tuple[str, ...]:
+        """Names of the boxes that it stands on; none for the table."""
+        if self.on is None:
+            return ()
+        return (self.on,) if isinstance(self.on, str) else self.on
 
     @property
     def bottom(self) -> float:
@@ -86,6 +120,9 @@ class Box:
         return abs(c * dx + s * dy) <= self.size[0] / 2 and abs(c * dy - s * dx) <= self.size[1] / 2
 
 
+_NOWHERE = 1e-6  # m; what is shorter has no direction
+_MOST_PIXELS = 4096  # a side of a picture
+
 TEXTURES = ("checks", "stripes", "noise")
 """Patterns that a table can have: squares, bands across its angle, cloudy spots."""
 
@@ -99,9 +136,9 @@ class Texture:
     """The second colour; the first is the table's own."""
     scale: Length
     """Edge of a square, width of a band or size of a spot, m."""
-    angle: float = 0.0
+    angle: Angle = 0.0
     """Turn of the pattern about z, rad."""
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    seed: Annotated[Whole, Field(ge=0, lt=2**31)] = 0
     """Where the pattern lies; which one it is, for `noise`."""
 
 
@@ -122,12 +159,20 @@ class Camera:
 
     eye: Vector = (-0.66, 0.0, 0.66)
     target: Vector = (0.0, 0.0, 0.0)
-    width: Annotated[int, Field(gt=0)] = 320
-    height: Annotated[int, Field(gt=0)] = 192
-    fov: Annotated[float, Field(gt=0, lt=180)] = 47.0
+    width: Annotated[Whole, Field(gt=0, le=_MOST_PIXELS)] = 320
+    height: Annotated[Whole, Field(gt=0, le=_MOST_PIXELS)] = 192
+    fov: Annotated[float, Strict(), Field(ge=0.1, lt=180)] = 47.0
     """Horizontal field of view, degrees."""
     near: Length = 0.038
     far: Length = 100.0
+
+    @model_validator(mode="after")
+    def _sees(self) -> Camera:
+        if math.dist(self.eye, self.target) < _NOWHERE:
+            raise ValueError(f"target {list(self.target)} is where the eye is, expected another")
+        if self.near >= self.far:
+            raise ValueError(f"near {self.near:g} m, expected less than far, {self.far:g} m")
+        return self
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
@@ -143,7 +188,15 @@ class Light:
     ambient: Unit = 0.6
     diffuse: Unit = 0.4
     specular: Unit = 0.05
-    shadow: bool = True
+    shadow: Annotated[bool, Strict()] = True
+
+    @model_validator(mode="after")
+    def _shines(self) -> Light:
+        if math.hypot(*self.direction) < _NOWHERE:
+            raise ValueError(f"direction {list(self.direction)}, expected one that leads somewhere")
+        if self.ambient + self.diffuse <= 0 or max(self.color) <= 0:
+            raise ValueError("it is dark, expected ambient or diffuse light of some colour")
+        return self
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
@@ -151,7 +204,7 @@ class Robot:
     """Where the Franka Panda stands."""
 
     base: Vector = (-0.48, 0.0, 0.0)
-    yaw: float = 0.0
+    yaw: Turn = 0.0
 
 
 def footprint_gap(a: Box, b: Box) -> float:

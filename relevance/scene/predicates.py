@@ -1,6 +1,7 @@
 """What a goal asks for: spatial relations, one object each, and the goals made of them.
 
-Directions are the robot's: left is +y of its base frame, in front is nearer to it. A new
+Directions are the robot's: left is +y of its base frame, in front is nearer to it, wherever it
+stands and however it is turned. A new
 relation is one more object here; one whose region is of another shape also needs a rule for
 that shape in the planner (`planner.pose`).
 """
@@ -13,12 +14,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass as plain_dataclass
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, InstanceOf, PlainSerializer
+from pydantic import AfterValidator, BeforeValidator, InstanceOf, PlainSerializer
 from pydantic.dataclasses import dataclass
 
-from relevance.errors import RelevanceError
 from relevance.registry import Registry
 from relevance.scene.boxes import CHECKED, Box, Robot, SceneError
+from relevance.scene.words import normal, shown
 
 GAP = 0.05
 """Depth of a same-plane goal region, m (DESIGN section 2)."""
@@ -74,10 +75,10 @@ class Predicate(ABC):
     def holds(self, subject: Box, reference: Box, robot: Robot, tolerance: float = 1e-3) -> bool:
         """Whether the relation is true of two boxes, up to `tolerance` (m)."""
         if self.stacked:
-            stands = subject.on == reference.name
+            stands = reference.name in subject.supports
             stands = stands and abs(subject.bottom - reference.top) <= tolerance
         else:
-            stands = subject.on is None and abs(subject.bottom) <= tolerance
+            stands = not subject.supports and abs(subject.bottom) <= tolerance
         there = self.region(subject, reference, robot)
         # a centre that is not over the face falls down: no tolerance on top of a box
         return stands and there.contains(*subject.position[:2], 0.0 if self.stacked else tolerance)
@@ -158,8 +159,8 @@ class Goal:
     predicate: Annotated[
         InstanceOf[Predicate], BeforeValidator(_named), PlainSerializer(str, return_type=str)
     ]
-    subject: str
-    reference: str
+    subject: Annotated[str, AfterValidator(normal)]
+    reference: Annotated[str, AfterValidator(normal)]
 
     def __str__(self) -> str:
         return f"{self.predicate}({self.subject}, {self.reference})"
@@ -167,16 +168,17 @@ class Goal:
     @classmethod
     def parse(cls, text: str) -> Goal:
         """Read `predicate(subject, reference)`; raises SceneError on anything else."""
-        name, bracket, rest = text.partition("(")
+        where = f"goal {shown(text)}"
+        name, bracket, rest = normal(text).partition("(")
         names = [part.strip() for part in rest.strip().removesuffix(")").split(",")]
         if not bracket or not rest.strip().endswith(")") or len(names) != 2 or not all(names):
-            raise SceneError(f"goal {text!r}: expected predicate(subject, reference)")
-        try:
-            predicate = PREDICATES[name.strip()]
-        except RelevanceError as error:
-            raise SceneError(f"goal {text!r}: {error}") from None
+            raise SceneError(f"{where}: expected predicate(subject, reference)")
+        if name.strip() not in PREDICATES:
+            found, known = shown(name.strip()), ", ".join(PREDICATES)
+            raise SceneError(f"{where}: unknown predicate {found}, expected one of {known}")
+        predicate = PREDICATES[name.strip()]
         if names[0] == names[1]:
-            raise SceneError(f"goal {text!r}: subject and reference are the same object")
+            raise SceneError(f"{where}: subject and reference are the same object")
         return cls(predicate=predicate, subject=names[0], reference=names[1])
 
 

@@ -1,43 +1,37 @@
-"""Scenes: what is physically possible, and how they are read and written as JSON."""
+"""Scenes: boxes, what surrounds them, and the goals asked of them."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+import numpy as np
+from pydantic import Field, TypeAdapter, model_validator
 from pydantic.dataclasses import dataclass
 
 from relevance.hashing import content_hash
-from relevance.scene.boxes import (
-    CHECKED,
-    Box,
-    Camera,
-    Light,
-    Robot,
-    SceneError,
-    Table,
-    footprint_gap,
-)
+from relevance.scene.boxes import CHECKED, Box, Camera, Light, Robot, SceneError, Table, wrapped
+from relevance.scene.contacts import check_boxes
 from relevance.scene.plans import Pose
 from relevance.scene.predicates import Goal
-
-CONTACT_TOLERANCE = 0.001
-"""How far a box may sink into or float over what it touches, m."""
+from relevance.scene.projection import project, vertices
+from relevance.scene.words import Id, normal, shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
 class Scene:
-    """A tabletop; raises SceneError (through pydantic) unless it is physically possible."""
+    """A tabletop; raises SceneError (through pydantic) unless it is physically possible.
 
-    id: str = ""
+    Scenes are equal, and have equal hashes, when all of their fields are: one can be the key of
+    a cache, whatever ids people choose.
+    """
+
+    id: Id = ""
     """Content hash when left empty."""
     objects: Annotated[tuple[Box, ...], Field(min_length=1)]
     goals: tuple[str, ...] = ()
-    """Goals asked of it, as text."""
+    """Goals asked of it, as text: `predicate(subject, reference)`."""
     table: Table = Table()
     camera: Camera = Camera()
     light: Light = Light()
@@ -45,9 +39,16 @@ class Scene:
 
     @model_validator(mode="after")
     def _possible(self) -> Scene:
-        _check_boxes(self.objects, self.table)
-        for text in self.goals:
-            self.goal(text)
+        # However turns are written, equal scenes are one; planners would break ties differently.
+        turns = [wrapped(box.yaw) for box in self.objects]
+        if turns != [box.yaw for box in self.objects]:
+            pairs = zip(self.objects, turns, strict=True)
+            object.__setattr__(
+                self, "objects", tuple(replace(box, yaw=turn) for box, turn in pairs)
+            )
+        check_boxes(self.objects, self.table, self.robot)
+        _check_camera(self.camera, self.objects)
+        object.__setattr__(self, "goals", tuple(str(self.goal(text)) for text in self.goals))
         if not self.id:
             body = TypeAdapter(Scene).dump_python(self, mode="json", exclude={"id", "goals"})
             if self.table.texture is None:  # a plain table hashes as it did before there were any
@@ -57,10 +58,10 @@ class Scene:
 
     def __getitem__(self, name: str) -> Box:
         for box in self.objects:
-            if box.name == name:
+            if box.name == normal(name):
                 return box
-        known = ", ".join(box.name for box in self.objects)
-        raise SceneError(f"unknown object {name!r}, expected one of {known}")
+        known = ", ".join(self.names)
+        raise SceneError(f"unknown object {shown(name)}, expected one of {known}")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -73,7 +74,9 @@ class Scene:
         for name in (goal.subject, goal.reference):
             if name not in self.names:
                 known = ", ".join(self.names)
-                raise SceneError(f"goal {str(goal)!r}: unknown object {name!r}, have {known}")
+                raise SceneError(
+                    f"goal {shown(str(goal))}: unknown object {shown(name)}, have {known}"
+                )
         return goal
 
     def moved(self, final: Mapping[str, Pose]) -> tuple[Box, ...]:
@@ -91,90 +94,17 @@ class Scene:
         )
 
 
-def _check_boxes(objects: tuple[Box, ...], table: Table) -> None:
-    names = [box.name for box in objects]
-    for i, box in enumerate(objects):
-        where = f"objects.{i} ({box.name!r})"
-        if box.name in names[:i] or box.name == "table":
-            raise SceneError(f"{where}: name is taken, expected distinct names other than 'table'")
-        reach = (abs(at) + extent for at, extent in zip(box.position, box.extents, strict=False))
-        if any(
-            far > edge / 2 + CONTACT_TOLERANCE for far, edge in zip(reach, table.size, strict=True)
-        ):
-            raise SceneError(
-                f"{where}: position {list(box.position)} is off the table, "
-                f"expected its footprint within +-{table.size[0] / 2:g}, +-{table.size[1] / 2:g} m"
-            )
-        if box.on is None:
-            support, floor = "the table", 0.0
-        elif box.on == box.name or box.on not in names:
-            raise SceneError(f"{where}: on = {box.on!r}, expected null or another object's name")
-        else:
-            below = objects[names.index(box.on)]
-            support, floor = repr(box.on), below.top
-            if not below.covers(*box.position[:2]):
-                raise SceneError(f"{where}: floating, expected its centre over {support}")
-        if abs(box.bottom - floor) > CONTACT_TOLERANCE:
-            state = "floating above" if box.bottom > floor else "sunk into"
-            raise SceneError(
-                f"{where}: {state} {support}, expected position z {floor + box.size[2] / 2:g}, "
-                f"found {box.position[2]:g}"
-            )
-        for other in objects[:i]:
-            depth = -max(box.bottom - other.top, other.bottom - box.top, footprint_gap(box, other))
-            if depth > CONTACT_TOLERANCE:
-                raise SceneError(
-                    f"{where}: overlaps {other.name!r} by {1000 * depth:.1f} mm, "
-                    "expected boxes apart or touching"
-                )
+_DEFAULT_CAMERA = Camera()
 
 
-_SCENE = TypeAdapter(Scene)
-
-
-def scene_to_json(scene: Scene) -> str:
-    """One line of JSON; `scene_from_json` gives an equal scene back."""
-    return _SCENE.dump_json(scene).decode()
-
-
-def scene_from_json(text: str | bytes, *, where: str = "scene") -> Scene:
-    """Read one scene; raises SceneError that names `where`, the field and what was expected."""
-    try:
-        return _SCENE.validate_json(text)
-    except ValidationError as error:
-        errors = error.errors(include_url=False)
-        # A misspelt field is missing and unknown at once: the unknown one says more.
-        first = next((e for e in errors if e["type"] == "unexpected_keyword_argument"), errors[0])
-        field = ".".join(str(part) for part in first["loc"])
-        found = first["input"] if isinstance(first["input"], str | int | float) else None
-        message = first["msg"].removeprefix("Value error, ")
-        if first["type"] == "unexpected_keyword_argument":
-            message = "unknown field"
-        text = ": ".join(part for part in (where, field, message) if part)
-        if found is not None and repr(found) not in text:
-            text += f" (found {found!r})"
-        raise SceneError(text) from None
-
-
-def read_scenes(path: str | Path) -> list[Scene]:
-    """Read a JSON file (one scene or a list) or JSON lines (one scene a line).
-
-    Raises SceneError naming file, line and field; FileNotFoundError becomes one too.
-    """
-    path = Path(path)
-    try:
-        text = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path}: cannot be read as text ({error})") from None
-    try:
-        whole = json.loads(text)
-    except json.JSONDecodeError:
-        lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
-        if not lines:
-            raise SceneError(f"{path}: is empty, expected at least one scene") from None
-        return [scene_from_json(line, where=f"{path}:{n}") for n, line in lines]
-    if isinstance(whole, list):
-        return [
-            scene_from_json(json.dumps(item), where=f"{path}[{n}]") for n, item in enumerate(whole)
-        ]
-    return [scene_from_json(text, where=f"{path}:1")]
+def _check_camera(camera: Camera, objects: tuple[Box, ...]) -> None:
+    """Raise SceneError when near and far cut off all that is in front of the camera."""
+    if camera == _DEFAULT_CAMERA:
+        return
+    _, depth = project(camera, np.concatenate([vertices(box) for box in objects]))
+    ahead = depth[depth > 0]
+    if len(ahead) and not ((ahead > camera.near) & (ahead < camera.far)).any():
+        raise SceneError(
+            f"camera: sees nothing from near {camera.near:g} to far {camera.far:g} m, "
+            f"expected some of {ahead.min():.3g} to {ahead.max():.3g} m between them"
+        )

@@ -6,6 +6,7 @@ The only part of the project that imports pybullet.
 from relevance.simulation.rendering import (
     MIN_VISIBLE_FRACTION,
     MIN_VISIBLE_PIXELS,
+    RENDERER_VERSION,
     VIEW_PIXELS,
     Renderer,
     Rendering,
@@ -17,6 +18,7 @@ __all__ = [
     "MAX_PENETRATION",
     "MIN_VISIBLE_FRACTION",
     "MIN_VISIBLE_PIXELS",
+    "RENDERER_VERSION",
     "VIEW_PIXELS",
     "Renderer",
     "Rendering",

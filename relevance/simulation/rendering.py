@@ -6,9 +6,10 @@ pixels (and the pattern on it, if any) are filled in closed form, far faster; th
 of a full render. Shadows are closed form too, on the table and on the boxes: TinyRenderer's
 shadow map speckles faces that the light grazes. So is the number of pixels that a box would show
 alone (a convex silhouette); nothing is rendered twice. The loops over pixels are compiled
-(`shadows`). Light arguments persist in pybullet from one call to the next, so every call passes
-all of them; each scene starts from `resetSimulation`, which leaks least. The arm is left out: its
-meshes cost more than the rest of the picture.
+(`painting`). Canonical views are taken before anybody knows a scene: under one nominal light.
+Light arguments persist in pybullet from one call to the next, so every call passes all of them;
+each scene starts from `resetSimulation`, which leaks least. The arm is left out: its meshes cost
+more than the rest of the picture.
 """
 
 from __future__ import annotations
@@ -22,12 +23,13 @@ from types import TracebackType
 
 import numpy as np
 
-from relevance.sampling import camera_up, pinhole, row, rows
-from relevance.scene import Box, Camera, Color, Light, Scene, Table
+from relevance.scene import Box, Camera, Color, Light, Scene, Table, camera_up, pinhole
+from relevance.scene.geometry import packed, uprights
 from relevance.simulation.bullet import pybullet
-from relevance.simulation.shadows import SHADOWED, ground, halved, paint, silhouettes
-from relevance.simulation.textures import pattern
+from relevance.simulation.painting import SHADOWED, ground, halved, paint, pattern, silhouettes
 
+RENDERER_VERSION = "1"
+"""Raised when an equal scene comes to give other pixels, masks, views or visible shares."""
 VIEW_PIXELS = 32
 """Edge of a canonical view, pixels."""
 MIN_VISIBLE_FRACTION = 0.25
@@ -48,6 +50,7 @@ _VIEW_CAMERA = Camera(
     near=0.5,
     far=2.0,
 )
+_VIEW_LIGHT = Light()
 _VIEW_YAW = 0.5
 _CACHED_VIEWS = 1024
 _CACHED_SHADES = 64
@@ -109,11 +112,11 @@ class Renderer:
         for box in scene.objects:
             body = self._create(box)
             assert body == len(views), "ids count up from 0 after a reset"
-            views.append(self._view(body, box, light))
+            views.append(self._view(body, box))
             self._put(body, _PARKED, 0.0)
         for body, box in enumerate(scene.objects):
             self._put(body, box.position, box.yaw)
-        boxes = rows(scene.objects)
+        boxes = uprights(scene.objects)
         alone, part = _silhouettes(boxes, camera)
         image, mask, visible = paint(
             *self._picture(camera, light, part),
@@ -206,15 +209,16 @@ class Renderer:
         ids[window] = np.reshape(np.asarray(bodies), (high, wide))
         return whole, ids
 
-    def _view(self, body: int, box: Box, light: Light) -> np.ndarray:
+    def _view(self, body: int, box: Box) -> np.ndarray:
         """Canonical view of a box, alone in front of the camera, (32, 32, 3) uint8."""
-        key = (box.size, box.color, light)
+        key = (box.size, box.color)
         if key in self._views:
             self._views.move_to_end(key)
             return self._views[key]
         self._put(body, (0.0, 0.0, 0.0), _VIEW_YAW)
-        posed = np.array([row(box.size, (0.0, 0.0, 0.0), _VIEW_YAW)])
-        pixels, bodies = self._picture(_VIEW_CAMERA, light, _silhouettes(posed, _VIEW_CAMERA)[1])
+        posed = packed(box.size, (0.0, 0.0, 0.0), _VIEW_YAW)
+        part = _silhouettes(posed[None], _VIEW_CAMERA)[1]
+        pixels, bodies = self._picture(_VIEW_CAMERA, _VIEW_LIGHT, part)
         view = halved(pixels, bodies, body, _VIEW_BACKGROUND)
         self._views[key] = view
         if len(self._views) > _CACHED_VIEWS:
@@ -301,7 +305,7 @@ def _source(light: Light) -> np.ndarray:
 
 
 def _silhouettes(boxes: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """`silhouettes` of rows (N, ROW) in a camera's picture."""
+    """`silhouettes` of rows (N, UPRIGHT) in a camera's picture."""
     return silhouettes(boxes, *pinhole(camera), camera.width, camera.height, camera.near)
 
 

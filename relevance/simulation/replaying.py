@@ -303,7 +303,7 @@ class _Run:
     def _pick(self, name: str, opening: float) -> None:
         if self.held is not None:
             raise _Refused(f"{self.where}: the hand holds {self.held!r} already")
-        burden = [box.name for box in self.boxes.values() if box.on == name]
+        burden = [box.name for box in self.boxes.values() if name in box.supports]
         if burden:
             raise _Refused(f"{self.where}: {burden[0]!r} stands on it")
         inverse = pybullet.invertTransform(*self.arena.hand())

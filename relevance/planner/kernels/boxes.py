@@ -1,7 +1,6 @@
 """Separating-axis distances of boxes, with gradients; upright boxes are the obstacles.
 
-An obstacle is a row of UPRIGHT numbers: x, y, z, yaw, half extents (3), and, so that they are
-computed once, the radius of its footprint and the cosine and sine of its yaw.
+An obstacle is a row of UPRIGHT numbers (`relevance.scene.geometry`).
 
 `separation` looks along the six face normals only. That is exact for two upright boxes and
 never above the true distance otherwise, so a margin kept here is a margin kept.
@@ -15,17 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-UPRIGHT = 10
-
-
-@njit(cache=True)
-def upright(x, y, z, yaw, hx, hy, hz, row):
-    """Fill an obstacle row."""
-    row[0], row[1], row[2], row[3] = x, y, z, yaw
-    row[4], row[5], row[6] = hx, hy, hz
-    row[7] = math.sqrt(hx * hx + hy * hy)
-    row[8], row[9] = math.cos(yaw), math.sin(yaw)
-
 
 class Bodies(NamedTuple):
     """Boxes that move with the arm during one motion, each aligned with its link's axes."""
@@ -38,20 +26,6 @@ class Bodies(NamedTuple):
     """(B, 3) m."""
     radius: np.ndarray
     """(B,) of the sphere around each, m."""
-
-
-@njit(cache=True)
-def rectangle_gap(ax, ay, ca, sa, ahx, ahy, bx, by, cb, sb, bhx, bhy):
-    """Separating-axis distance of two rectangles, m (exact depth when negative).
-
-    Centre, cosine and sine of the yaw, and half extents of one, then of the other.
-    """
-    dx, dy = bx - ax, by - ay
-    c, s = abs(ca * cb + sa * sb), abs(sa * cb - ca * sb)
-    gap = abs(ca * dx + sa * dy) - ahx - c * bhx - s * bhy
-    gap = max(gap, abs(ca * dy - sa * dx) - ahy - s * bhx - c * bhy)
-    gap = max(gap, abs(cb * dx + sb * dy) - bhx - c * ahx - s * ahy)
-    return max(gap, abs(cb * dy - sb * dx) - bhy - s * ahx - c * ahy)
 
 
 @njit(cache=True)

@@ -357,7 +357,7 @@ def rai_problem(scene: Scene, goal: Goal, *, movable: Collection[str]) -> RaiPro
     lines = [*_world(scene, "is_table, clear" if on else "is_table, clear, is_base"), *lines]
     turn = {box.name: math.pi / 2 if box.size[0] < box.size[1] else 0.0 for box in scene.objects}
     places = {"target": goal.reference if on else "table", "table": "table"}
-    carrying = {box.on for box in scene.objects}
+    carrying = {name for box in scene.objects for name in box.supports}
     for box in scene.objects:
         facts = [] if box.name in carrying else ["clear"]
         stays = box.name not in movable or (box.name == goal.reference and not on)
@@ -373,7 +373,7 @@ def rai_problem(scene: Scene, goal: Goal, *, movable: Collection[str]) -> RaiPro
     for i, a in enumerate(scene.objects):
         pairs["boxes"].append([ids[a.name], "foot", ids[a.name], ids[a.name]])
         for b in scene.objects[:i]:
-            if b.name == a.on or a.name == b.on:
+            if b.name in a.supports or a.name in b.supports:
                 continue
             # Boxes that stand closer than their grown shapes allow are kept apart as they are.
             close = footprint_gap(a, b) < 2 * _growth() + 2e-4
@@ -457,12 +457,13 @@ def _box(
     x, y, z = box.size
     size = (y, x, z) if turn[box.name] else (x, y, z)
     yaw, position = box.yaw + turn[box.name], np.array(box.position)
-    parent = "table" if box.on is None else ids[box.on]
-    if box.on is None:
+    support = next(iter(box.supports), None)
+    parent = "table" if support is None else ids[support]
+    if support is None:
         position = position + np.array([0, 0, 0.05])
     else:
-        below = scene[box.on]
-        angle = below.yaw + turn[box.on]
+        below = scene[support]
+        angle = below.yaw + turn[support]
         dx, dy, dz = position - np.array(below.position)
         c, s = math.cos(angle), math.sin(angle)
         position, yaw = np.array([c * dx + s * dy, c * dy - s * dx, dz]), yaw - angle

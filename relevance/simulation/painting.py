@@ -1,6 +1,6 @@
-"""The closed-form parts of a picture: ground, shadows, silhouettes and the shrinking of views.
+"""The closed-form parts of a picture: ground and its patterns, shadows, silhouettes, small views.
 
-Compiled loops over pixels. Boxes are rows as `relevance.sampling.rows` has them; eye, axes and
+Compiled loops over pixels. Boxes are rows as `relevance.scene.geometry` has them; eye, axes and
 focal length are those of `pinhole`. TinyRenderer samples pixel (row, column) at x = column,
 y = row + 1: with these points the silhouettes equal the rendered ones pixel by pixel.
 
@@ -14,7 +14,8 @@ import math
 import numpy as np
 from numba import njit
 
-from relevance.sampling import bound, corners, crossing, extents, projected
+from relevance.scene import Texture
+from relevance.scene.geometry import bound, corners, crossing, extents, projected
 
 SHADOWED = 0.8
 """The share of direct light that TinyRenderer leaves in a shadow."""
@@ -40,7 +41,7 @@ def paint(pixels, bodies, boxes, ambient, points, eye, axes, focal, source, shad
     """Table, floor and all shadows, around and on the boxes that pybullet drew.
 
     pixels (H, W, 4) and bodies (H, W): RGBA and box indices (-1: none) of its picture. boxes
-    (N, ROW), ambient (N, 3): their colours in ambient light alone, 0..255. points: of `ground`.
+    (N, UPRIGHT), ambient (N, 3): their colours in ambient light alone, 0..255. points: of `ground`.
     source: where the light stands, (3,), m; (0,) for no shadows. shades: the table's
     pixels in the light and in a shadow, (2, H, W, 3); floor: RGB.
     Returns image (H, W, 3) and mask (H, W), uint8, and how many pixels each box shows (N,).
@@ -165,7 +166,7 @@ def _shadows(boxes, source):
         for k in range(2):
             both[k], both[2 + k] = -np.inf, np.inf
         # A light that stands lower than the box casts no shadow of it on the table.
-        if source[2] > boxes[j, 2] + boxes[j, 5]:
+        if source[2] > boxes[j, 2] + boxes[j, 6]:
             points = corners(boxes[j])
             for k in range(8):
                 scale = source[2] / (source[2] - points[k, 2])
@@ -178,10 +179,10 @@ def _shadows(boxes, source):
                 both[k] = min(both[k], bounds[j, k])
                 both[2 + k] = max(both[2 + k], bounds[j, 2 + k])
         for i in range(count):
-            (x, y), (ex, ey) = (boxes[i, 0], boxes[i, 1]), extents(boxes[i])
+            (x, y), (ex, ey) = (boxes[i, 0], boxes[i, 1]), extents(boxes[i], 1.0, 0.0)
             reaches[i, j] = (
                 i != j
-                and boxes[j, 2] + boxes[j, 5] > boxes[i, 2] - boxes[i, 5]
+                and boxes[j, 2] + boxes[j, 6] > boxes[i, 2] - boxes[i, 6]
                 and both[0] <= x + ex
                 and both[1] <= y + ey
                 and both[2] >= x - ex
@@ -255,3 +256,49 @@ def _turn(hull, a, b, x, y):
     """Over 0 when (x, y) lies left of the line from one point of a hull to another."""
     ax, ay = hull[a, 0], hull[a, 1]
     return (hull[b, 0] - ax) * (y - ay) - (hull[b, 1] - ay) * (x - ax)
+
+
+def pattern(texture: Texture, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Share of the second colour at points x, y on the table (any shape), m: 0 to 1.
+
+    A function of the place and of the texture's parameters alone, so a stored scene gives the
+    same pixels again, on any machine, with no texture file. Noise comes from hashed whole numbers
+    rather than from a generator or a sine, whose last digits differ between machines.
+    """
+    c, s = math.cos(texture.angle), math.sin(texture.angle)
+    along, across = (c * x + s * y) / texture.scale, (c * y - s * x) / texture.scale
+    # Where the pattern lies: two numbers in 0..1 of the seed.
+    shift = _hashed(np.arange(2), np.zeros(2, dtype=np.int64), texture.seed)
+    along, across = along + shift[0], across + shift[1]
+    if texture.kind == "checks":
+        return (np.floor(along) + np.floor(across)) % 2
+    if texture.kind == "stripes":
+        # Bands that waver slowly along their length, like the grain of wood.
+        place = across + 0.6 * _noise(along / 8, across / 2, texture.seed)
+        return np.abs(place % 2 - 1)
+    return (
+        2 * _noise(along, across, texture.seed) + _noise(3 * along, 3 * across, texture.seed)
+    ) / 3
+
+
+def _noise(u: np.ndarray, v: np.ndarray, seed: int) -> np.ndarray:
+    """Smooth noise in 0..1: hashed values at whole numbers, blended between them."""
+    i, j = np.floor(u), np.floor(v)
+    a, b = u - i, v - j
+    a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
+    i, j = i.astype(np.int64), j.astype(np.int64)
+    near = _hashed(i, j, seed) * (1 - a) + _hashed(i + 1, j, seed) * a
+    far = _hashed(i, j + 1, seed) * (1 - a) + _hashed(i + 1, j + 1, seed) * a
+    return near * (1 - b) + far * b
+
+
+def _hashed(i: np.ndarray, j: np.ndarray, seed: int) -> np.ndarray:
+    """A number in [0, 1) for each lattice point: multiply, fold, multiply (as murmur3 ends)."""
+    mixed = i.astype(np.uint32) * np.uint32(0x9E3779B1)
+    mixed ^= j.astype(np.uint32) * np.uint32(0x85EBCA77)
+    mixed += np.uint32(seed)
+    for factor in (0x85EBCA6B, 0xC2B2AE35):
+        mixed ^= mixed >> np.uint32(15)
+        mixed *= np.uint32(factor)
+    mixed ^= mixed >> np.uint32(16)
+    return mixed / 2**32

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from relevance.scene import Box, Camera
+from relevance.scene.boxes import Box, Camera
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,30 +9,26 @@ face that it can see.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from relevance.sampling.projection import pinhole
-from relevance.sampling.rows import (
-    ROW,
+from relevance.sampling.settings import SceneConfig
+from relevance.scene import GAP, Box, pinhole
+from relevance.scene.contacts import ROBOT_RADIUS
+from relevance.scene.geometry import (
+    UPRIGHT,
     bound,
     corners,
     covers,
     crossing,
     extents,
-    gap,
+    flat_gap,
+    packed,
     projected,
-    row,
 )
-from relevance.scene import GAP, Box
 
-if TYPE_CHECKING:
-    from relevance.sampling.scenes import SceneConfig
-
-GRASPABLE_EDGE = 0.07
-"""Longest footprint edge that the hand (opening 8 cm) takes with room to spare, m."""
 COMMON_RADIUS = 0.0275
 """Half the shorter footprint edge of a common subject, m."""
 
@@ -54,6 +50,7 @@ class _Limits(NamedTuple):
     height: float
     image_margin: float
     near: float
+    far: float
     visible: float
 
 
@@ -61,7 +58,7 @@ class _Shown(NamedTuple):
     """The boxes drawn so far, up to N: rows to fill in, of which the first few are in use."""
 
     boxes: np.ndarray
-    """(N, ROW)."""
+    """(N, UPRIGHT)."""
     bounds: np.ndarray
     """(N, 4): in the image, lowest x and y, then highest, px from its middle."""
     points: np.ndarray
@@ -88,13 +85,16 @@ class Standing:
             camera.height,
             config.image_margin,
             camera.near,
+            camera.far,
             config.visible,
         )
         self._limits = _Limits(*map(float, limits))  # one type of number: compiled once
+        turn = config.robot.yaw
+        self._turn = math.cos(turn), math.sin(turn)
         self._eye, self._axes, self._focal = pinhole(camera)
         most = config.max_objects + 1
         self._shown = _Shown(
-            np.empty((most, ROW)),
+            np.empty((most, UPRIGHT)),
             np.empty((most, 4)),
             np.empty((most, 27, 3)),
             np.empty((most, 27)),
@@ -111,29 +111,31 @@ class Standing:
 
     def closes(self, candidate: np.ndarray) -> int:
         """How many goal regions a new box closes: those it stands in, and its own."""
-        return _closed(candidate, len(self.boxes), self._shown.boxes)
+        return _closed(candidate, len(self.boxes), self._shown.boxes, *self._turn)
 
     def add(self, box: Box) -> None:
         """Put the box there; it must have been admitted."""
         count, view = len(self.boxes), (self._eye, self._axes, self._focal)
-        self._shown.boxes[count] = row(box.size, box.position, box.yaw)
+        self._shown.boxes[count] = packed(box.size, box.position, box.yaw)
         _place(count, self._shown, self._limits, *view)
         self.boxes.append(box)
 
 
 @njit(cache=True)
 def _fits(box, carrier, count, shown, limits, eye, axes, focal):
-    """`Standing.admits` for a box (ROW,) among the first few that are shown."""
+    """`Standing.admits` for a box (UPRIGHT,) among the first few that are shown."""
     distance = math.hypot(box[0] - limits.base_x, box[1] - limits.base_y)
     if not limits.nearest <= distance <= limits.farthest:
         return False
-    ex, ey = extents(box)
+    if distance - box[7] < ROBOT_RADIUS:
+        return False
+    ex, ey = extents(box, 1.0, 0.0)
     if abs(box[0]) + ex > limits.half_x or abs(box[1]) + ey > limits.half_y:
         return False
     for j in range(count):
         other = shown.boxes[j]
-        above = (box[2] - box[5]) - (other[2] + other[5]) >= limits.spacing
-        if j != carrier and not above and gap(box, other) < limits.spacing:
+        above = (box[2] - box[6]) - (other[2] + other[6]) >= limits.spacing
+        if j != carrier and not above and flat_gap(box, other) < limits.spacing:
             return False
     bounds = np.empty(4)
     return _seen(box, limits, eye, axes, focal, bounds) and _shows(
@@ -146,7 +148,7 @@ def _seen(box, limits, eye, axes, focal, bounds):
     """Whether the box is wholly in the picture; fills its bounds there (4,), px."""
     points = projected(corners(box), eye, axes, focal)
     for k in range(8):
-        if points[k, 2] <= limits.near:
+        if not limits.near < points[k, 2] < limits.far:
             return False
     bound(points, bounds)
     x, y = limits.width / 2 - limits.image_margin, limits.height / 2 - limits.image_margin
@@ -207,16 +209,16 @@ def _faces(box, eye, points, shares):
     Of two opposite faces it is the one towards the camera; its share is what it takes of
     the picture of the box alone, which is none when the camera stands between the two.
     """
-    c, s = box[6], box[7]
+    c, s = box[8], box[9]
     dx, dy = eye[0] - box[0], eye[1] - box[1]
     local = (c * dx + s * dy, c * dy - s * dx, eye[2] - box[2])
     total = 0.0
     for k in range(27):
-        half = box[3 + k // 9]
+        half = box[4 + k // 9]
         facing = max(abs(local[k // 9]) - half, 0.0) / half
-        x = _FACES[k, 0] * math.copysign(box[3], local[0])
-        y = _FACES[k, 1] * math.copysign(box[4], local[1])
-        z = _FACES[k, 2] * math.copysign(box[5], local[2])
+        x = _FACES[k, 0] * math.copysign(box[4], local[0])
+        y = _FACES[k, 1] * math.copysign(box[5], local[1])
+        z = _FACES[k, 2] * math.copysign(box[6], local[2])
         sight = (local[0] - x) ** 2 + (local[1] - y) ** 2 + (local[2] - z) ** 2
         shares[k] = facing * sight**-1.5
         total += shares[k]
@@ -235,23 +237,28 @@ def _behind(point, box, eye):
 
 
 @njit(cache=True)
-def _closed(box, count, boxes):
-    """`Standing.closes` for a box (ROW,) among the first few of boxes (N, ROW)."""
+def _closed(box, count, boxes, c, s):
+    """`Standing.closes` for a box (UPRIGHT,) among the first few of boxes (N, UPRIGHT).
+
+    c, s: cosine and sine of the robot's yaw, whose directions the regions have.
+    """
     closed = 0
     for quarter in range(4):
-        x, y = _way_in(box, quarter)
+        x, y = _way_in(box, quarter, c, s)
         own = False
         for j in range(count):
             own |= covers(boxes[j], x, y)
-            other_x, other_y = _way_in(boxes[j], quarter)
+            other_x, other_y = _way_in(boxes[j], quarter, c, s)
             closed += covers(box, other_x, other_y)
         closed += own
     return closed
 
 
 @njit(cache=True)
-def _way_in(box, quarter):
+def _way_in(box, quarter, c, s):
     """The middle of one of a box's four goal regions, for a subject of common width."""
-    ex, ey = extents(box)
+    ex, ey = extents(box, c, s)
     away = (1 - quarter // 2 * 2) * ((ex if quarter % 2 == 0 else ey) + COMMON_RADIUS + GAP / 2)
-    return (box[0] + away, box[1]) if quarter % 2 == 0 else (box[0], box[1] + away)
+    if quarter % 2 == 0:
+        return box[0] + away * c, box[1] + away * s
+    return box[0] - away * s, box[1] + away * c
