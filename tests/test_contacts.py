@@ -124,6 +124,14 @@ def test_flat_tall_and_touching_boxes_are_fine():
     Scene(objects=(sheet, pole, *stack))
 
 
+def test_more_boxes_than_a_mask_can_name_are_refused():
+    many = [box(f"b{i}", 0.002 * (i % 16), 0.002 * (i // 16), (0.001,) * 3) for i in range(256)]
+    Scene(objects=tuple(many[:254]))
+    assert "at most 254 items" in refused(*many)
+    with pytest.raises(ValidationError, match=r"size\.0"):
+        box("dust", size=(1e-300, 0.05, 0.05))
+
+
 def test_thin_boxes_do_not_vanish_in_others():
     assert "overlaps" in refused(box("cube"), box("card", size=(0.04, 0.04, 0.0008)))
     cards = [box(n, size=(0.05, 0.05, 0.0004), z=z, on=on) for n, z, on in

@@ -126,7 +126,11 @@ def test_round_trip_is_exact(x, y, yaw, size):
         (raw(objects=None), "objects", "expected a list"),
         ({"id": "s1"}, "objects", "required"),
         (changed(1, size=[0.06, 0.05]), "objects.1.size.2", "required"),
-        (changed(1, size=[0.06, 0.05, -0.1]), "objects.1.size.2", "greater than 0"),
+        (
+            changed(1, size=[0.06, 0.05, -0.1]),
+            "objects.1.size.2",
+            "greater than or equal to 0.0001",
+        ),
         (changed(1, position=[math.nan, 0, 0.05]), "objects.1.position.0", "finite number"),
         (changed(1, yaw=math.inf), "objects.1.yaw", "finite number"),
         (changed(1, yaw="north"), "objects.1.yaw", "valid number"),

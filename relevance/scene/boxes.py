@@ -26,6 +26,7 @@ CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False)
 _FAR = 1e6  # m; beyond, and for far more turns than this, digits are lost
 
 Length = Annotated[float, Strict(), Field(gt=0, le=_FAR)]
+Edge = Annotated[Length, Field(ge=1e-4)]
 Unit = Annotated[float, Strict(), Field(ge=0, le=1)]
 Metres = Annotated[float, Strict(), Field(ge=-_FAR, le=_FAR)]
 Angle = Annotated[float, Strict(), Field(ge=-_FAR, le=_FAR)]
@@ -60,7 +61,7 @@ class Box:
     """One box, standing upright."""
 
     name: Name
-    size: tuple[Length, Length, Length]
+    size: tuple[Edge, Edge, Edge]
     """Full edge lengths along its own x, y, z, m."""
     position: Vector
     """Centre in the world frame, m."""
@@ -134,7 +135,7 @@ class Texture:
     kind: Literal["checks", "stripes", "noise"]
     color: Color
     """The second colour; the first is the table's own."""
-    scale: Length
+    scale: Edge
     """Edge of a square, width of a band or size of a spot, m."""
     angle: Angle = 0.0
     """Turn of the pattern about z, rad."""
@@ -146,7 +147,7 @@ class Texture:
 class Table:
     """The table, its top face at z = 0."""
 
-    size: tuple[Length, Length] = (0.8, 1.2)
+    size: tuple[Edge, Edge] = (0.8, 1.2)
     """Full edge lengths along x and y, m."""
     color: Color = (0.93, 0.92, 0.89)
     texture: Texture | None = None

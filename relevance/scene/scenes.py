@@ -18,6 +18,9 @@ from relevance.scene.predicates import Goal
 from relevance.scene.projection import project, vertices
 from relevance.scene.words import Id, normal, shown
 
+MOST_BOXES = 254
+"""Most boxes of a scene: a mask names each in a byte."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
 class Scene:
@@ -29,7 +32,7 @@ class Scene:
 
     id: Id = ""
     """Content hash when left empty."""
-    objects: Annotated[tuple[Box, ...], Field(min_length=1)]
+    objects: Annotated[tuple[Box, ...], Field(min_length=1, max_length=MOST_BOXES)]
     goals: tuple[str, ...] = ()
     """Goals asked of it, as text: `predicate(subject, reference)`."""
     table: Table = Table()
