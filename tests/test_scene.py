@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from relevance.hashing import content_hash
 from relevance.scene import (
     GAP,
     PREDICATES,
     Box,
+    Camera,
     Goal,
     Pose,
     Predicate,
@@ -423,10 +423,13 @@ def test_content_hash_depends_on_the_json_form_alone():
 
 
 def test_python_construction_is_checked_too():
-    with pytest.raises(ValidationError, match="overlaps 'red'"):
+    with pytest.raises(SceneError, match="overlaps 'red'"):
         Scene(objects=(box("red"), box("blue", 0.01)))
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(SceneError, match=r"^Box: position\.0: .*finite") as caught:
         box("red", math.nan)
+    assert str(caught.value).isprintable()
+    with pytest.raises(SceneError, match=r"^Camera: near 3 m, expected less than far, 1 m$"):
+        Camera(near=3.0, far=1.0)
 
 
 # ---------------------------------------------------------------- textures

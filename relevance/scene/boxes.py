@@ -9,19 +9,10 @@ import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Strict, model_validator
-from pydantic.dataclasses import dataclass
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, model_validator
 
-from relevance.errors import RelevanceError
+from relevance.scene.checks import checked
 from relevance.scene.words import Name
-
-
-class SceneError(RelevanceError):
-    """A scene or goal that cannot be: says which field, what it holds, what was expected."""
-
-
-CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False)
-"""How the fields of a scene are checked."""
 
 _FAR = 1e6  # m; beyond, and for far more turns than this, digits are lost
 
@@ -56,7 +47,7 @@ def _supports(value: Any) -> Any:
 Support = Annotated[Name | tuple[Name, ...] | None, BeforeValidator(_supports)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Box:
     """One box, standing upright."""
 
@@ -128,7 +119,7 @@ TEXTURES = ("checks", "stripes", "noise")
 """Patterns that a table can have: squares, bands across its angle, cloudy spots."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Texture:
     """A pattern on the table: parameters, not pixels, so that it can be drawn again exactly."""
 
@@ -143,7 +134,7 @@ class Texture:
     """Where the pattern lies; which one it is, for `noise`."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Table:
     """The table, its top face at z = 0."""
 
@@ -154,7 +145,7 @@ class Table:
     """None: of one colour."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Camera:
     """Pinhole camera; image-left is robot-left."""
 
@@ -176,7 +167,7 @@ class Camera:
         return self
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Light:
     """One distant light, as pybullet's TinyRenderer takes it."""
 
@@ -200,7 +191,7 @@ class Light:
         return self
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Robot:
     """Where the Franka Panda stands."""
 

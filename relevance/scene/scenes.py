@@ -8,10 +8,10 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
-from pydantic.dataclasses import dataclass
 
 from relevance.hashing import content_hash
-from relevance.scene.boxes import CHECKED, Box, Camera, Light, Robot, SceneError, Table, wrapped
+from relevance.scene.boxes import Box, Camera, Light, Robot, Table, wrapped
+from relevance.scene.checks import SceneError, checked
 from relevance.scene.contacts import check_boxes
 from relevance.scene.plans import Pose
 from relevance.scene.predicates import Goal
@@ -22,9 +22,9 @@ MOST_BOXES = 254
 """Most boxes of a scene: a mask names each in a byte."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Scene:
-    """A tabletop; raises SceneError (through pydantic) unless it is physically possible.
+    """A tabletop; raises SceneError unless it is physically possible.
 
     Scenes are equal, and have equal hashes, when all of their fields are: one can be the key of
     a cache, whatever ids people choose.
