@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from relevance.scene import (
     Box,
@@ -330,7 +329,7 @@ def scenes(draw) -> Scene:
             light=Light(ambient=draw(st.floats(0.1, 1)), shadow=draw(st.booleans())),
             robot=Robot(yaw=draw(st.floats(-9, 9))),
         )
-    except ValidationError:
+    except SceneError:
         assume(False)
         raise
 

@@ -231,6 +231,17 @@ def test_plans_of_turned_robots_end_where_the_robot_says(side, name):
     assert not goal_holds([a, b], goal, replace(robot, yaw=robot.yaw + math.pi))
 
 
+@pytest.mark.parametrize("goal", ["on(plate, c)", "on(a, c)"])
+def test_a_bridge_is_lifted_before_its_pillars(goal):
+    size = (0.05, 0.22, 0.03)
+    pillars = (box("a", 0, -0.07, (0.05,) * 3), box("b", 0, 0.07, (0.05,) * 3))
+    plate = box("plate", 0, 0, size, position=(0, 0, 0.065), on=("a", "b"))
+    scene = Scene(objects=(*pillars, plate, box("c", 0.1, -0.25, (0.05,) * 3)))
+    result = plan(scene, scene.goal(goal))
+    assert result.moved[0] == "plate"
+    assert replay(scene, scene.goal(goal), result.phases).ok
+
+
 @pytest.mark.parametrize(
     ("name", "reason"),
     [

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from relevance.hashing import content_hash
 from relevance.scene import (
     GAP,
     PREDICATES,
     Box,
+    Camera,
     Goal,
     Pose,
     Predicate,
@@ -126,7 +126,11 @@ def test_round_trip_is_exact(x, y, yaw, size):
         (raw(objects=None), "objects", "expected a list"),
         ({"id": "s1"}, "objects", "required"),
         (changed(1, size=[0.06, 0.05]), "objects.1.size.2", "required"),
-        (changed(1, size=[0.06, 0.05, -0.1]), "objects.1.size.2", "greater than 0"),
+        (
+            changed(1, size=[0.06, 0.05, -0.1]),
+            "objects.1.size.2",
+            "greater than or equal to 0.0001",
+        ),
         (changed(1, position=[math.nan, 0, 0.05]), "objects.1.position.0", "finite number"),
         (changed(1, yaw=math.inf), "objects.1.yaw", "finite number"),
         (changed(1, yaw="north"), "objects.1.yaw", "valid number"),
@@ -419,10 +423,13 @@ def test_content_hash_depends_on_the_json_form_alone():
 
 
 def test_python_construction_is_checked_too():
-    with pytest.raises(ValidationError, match="overlaps 'red'"):
+    with pytest.raises(SceneError, match="overlaps 'red'"):
         Scene(objects=(box("red"), box("blue", 0.01)))
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(SceneError, match=r"^Box: position\.0: .*finite") as caught:
         box("red", math.nan)
+    assert str(caught.value).isprintable()
+    with pytest.raises(SceneError, match=r"^Camera: near 3 m, expected less than far, 1 m$"):
+        Camera(near=3.0, far=1.0)
 
 
 # ---------------------------------------------------------------- textures

@@ -16,11 +16,11 @@ from relevance.scene.boxes import (
     Color,
     Light,
     Robot,
-    SceneError,
     Table,
     Texture,
     footprint_gap,
 )
+from relevance.scene.checks import SceneError
 from relevance.scene.contacts import CONTACT_TOLERANCE
 from relevance.scene.looks import lab, lookalikes
 from relevance.scene.plans import Action, Phase, Pose

@@ -9,23 +9,15 @@ import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Strict, model_validator
-from pydantic.dataclasses import dataclass
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, model_validator
 
-from relevance.errors import RelevanceError
+from relevance.scene.checks import checked
 from relevance.scene.words import Name
-
-
-class SceneError(RelevanceError):
-    """A scene or goal that cannot be: says which field, what it holds, what was expected."""
-
-
-CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False)
-"""How the fields of a scene are checked."""
 
 _FAR = 1e6  # m; beyond, and for far more turns than this, digits are lost
 
 Length = Annotated[float, Strict(), Field(gt=0, le=_FAR)]
+Edge = Annotated[Length, Field(ge=1e-4)]
 Unit = Annotated[float, Strict(), Field(ge=0, le=1)]
 Metres = Annotated[float, Strict(), Field(ge=-_FAR, le=_FAR)]
 Angle = Annotated[float, Strict(), Field(ge=-_FAR, le=_FAR)]
@@ -55,12 +47,12 @@ def _supports(value: Any) -> Any:
 Support = Annotated[Name | tuple[Name, ...] | None, BeforeValidator(_supports)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Box:
     """One box, standing upright."""
 
     name: Name
-    size: tuple[Length, Length, Length]
+    size: tuple[Edge, Edge, Edge]
     """Full edge lengths along its own x, y, z, m."""
     position: Vector
     """Centre in the world frame, m."""
@@ -127,14 +119,14 @@ TEXTURES = ("checks", "stripes", "noise")
 """Patterns that a table can have: squares, bands across its angle, cloudy spots."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Texture:
     """A pattern on the table: parameters, not pixels, so that it can be drawn again exactly."""
 
     kind: Literal["checks", "stripes", "noise"]
     color: Color
     """The second colour; the first is the table's own."""
-    scale: Length
+    scale: Edge
     """Edge of a square, width of a band or size of a spot, m."""
     angle: Angle = 0.0
     """Turn of the pattern about z, rad."""
@@ -142,18 +134,18 @@ class Texture:
     """Where the pattern lies; which one it is, for `noise`."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Table:
     """The table, its top face at z = 0."""
 
-    size: tuple[Length, Length] = (0.8, 1.2)
+    size: tuple[Edge, Edge] = (0.8, 1.2)
     """Full edge lengths along x and y, m."""
     color: Color = (0.93, 0.92, 0.89)
     texture: Texture | None = None
     """None: of one colour."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Camera:
     """Pinhole camera; image-left is robot-left."""
 
@@ -175,7 +167,7 @@ class Camera:
         return self
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Light:
     """One distant light, as pybullet's TinyRenderer takes it."""
 
@@ -199,7 +191,7 @@ class Light:
         return self
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Robot:
     """Where the Franka Panda stands."""
 

@@ -12,7 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from relevance.scene.boxes import Box, Robot, SceneError, Table, footprint_gap
+from relevance.scene.boxes import Box, Robot, Table, footprint_gap
+from relevance.scene.checks import SceneError
 
 CONTACT_TOLERANCE = 0.001
 """How far a box may sink into or float over what it touches, m; half of what is thinner."""

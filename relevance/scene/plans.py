@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from pydantic.dataclasses import dataclass
 
-from relevance.scene.boxes import CHECKED, Vector
+from relevance.scene.boxes import Vector
+from relevance.scene.checks import checked
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Pose:
     """Where a box stands: centre (m), yaw (rad), and on which box (None: table)."""
 

@@ -15,10 +15,10 @@ from dataclasses import dataclass as plain_dataclass
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, InstanceOf, PlainSerializer
-from pydantic.dataclasses import dataclass
 
 from relevance.registry import Registry
-from relevance.scene.boxes import CHECKED, Box, Robot, SceneError
+from relevance.scene.boxes import Box, Robot
+from relevance.scene.checks import SceneError, checked
 from relevance.scene.words import normal, shown
 
 GAP = 0.05
@@ -152,7 +152,7 @@ def _named(value: Any) -> Any:
     return PREDICATES[value] if isinstance(value, str) else value
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+@checked
 class Goal:
     """`predicate(subject, reference)`, e.g. `on-the-left(red, blue)`."""
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from relevance.scene.boxes import SceneError
+from relevance.scene.checks import SceneError, first_error
 from relevance.scene.scenes import Scene
 from relevance.scene.words import printable, shown
 
@@ -137,7 +137,7 @@ def _scene(value: Any, where: str) -> Scene:
     try:
         return _SCENE.validate_python(value)
     except ValidationError as error:
-        raise SceneError(f"{where}: {_first(error)}") from None
+        raise SceneError(f"{where}: {first_error(error)}") from None
 
 
 def _check_keys(value: Any, where: str) -> None:
@@ -152,33 +152,8 @@ def _check_keys(value: Any, where: str) -> None:
         waiting += [(f"{path}{k}.", part) for k, part in parts if isinstance(part, dict | list)]
 
 
-_SAID_BETTER = {
-    "unexpected_keyword_argument": "unknown field",
-    "dataclass_type": "expected an object",
-    "tuple_type": "expected a list",
-}
-_TRIED = ("function-after[", "tuple[", "str")
-_KINDS = {type(None): "null", list: "a list"}
-
-
 def _kind(value: Any) -> str:
-    return _KINDS.get(type(value)) or shown(value)
-
-
-def _first(error: ValidationError) -> str:
-    """`field: what was expected (found what)`, of the first thing that is wrong."""
-    errors = error.errors(include_url=False)
-    # A misspelt field is missing and unknown at once: the unknown one says more.
-    first = next((e for e in errors if e["type"] == "unexpected_keyword_argument"), errors[0])
-    # Where a name or a list of names is expected, the path says which was tried.
-    parts = [str(part) for part in first["loc"] if not str(part).startswith(_TRIED)]
-    field = shown(".".join(parts), 200)[1:-1]
-    message = _SAID_BETTER.get(first["type"], first["msg"].removeprefix("Value error, "))
-    text = ": ".join(part for part in (field, message) if part)
-    found = first["input"]
-    if not isinstance(found, str | int | float) or shown(found) in text:
-        return text
-    return text if message == "unknown field" else f"{text} (found {shown(found)})"
+    return {type(None): "null", list: "a list"}.get(type(value)) or shown(value)
 
 
 def _text(path: str | Path) -> tuple[str, str]:

@@ -8,20 +8,23 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
-from pydantic.dataclasses import dataclass
 
 from relevance.hashing import content_hash
-from relevance.scene.boxes import CHECKED, Box, Camera, Light, Robot, SceneError, Table, wrapped
+from relevance.scene.boxes import Box, Camera, Light, Robot, Table, wrapped
+from relevance.scene.checks import SceneError, checked
 from relevance.scene.contacts import check_boxes
 from relevance.scene.plans import Pose
 from relevance.scene.predicates import Goal
 from relevance.scene.projection import project, vertices
 from relevance.scene.words import Id, normal, shown
 
+MOST_BOXES = 254
+"""Most boxes of a scene: a mask names each in a byte."""
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=CHECKED)
+
+@checked
 class Scene:
-    """A tabletop; raises SceneError (through pydantic) unless it is physically possible.
+    """A tabletop; raises SceneError unless it is physically possible.
 
     Scenes are equal, and have equal hashes, when all of their fields are: one can be the key of
     a cache, whatever ids people choose.
@@ -29,7 +32,7 @@ class Scene:
 
     id: Id = ""
     """Content hash when left empty."""
-    objects: Annotated[tuple[Box, ...], Field(min_length=1)]
+    objects: Annotated[tuple[Box, ...], Field(min_length=1, max_length=MOST_BOXES)]
     goals: tuple[str, ...] = ()
     """Goals asked of it, as text: `predicate(subject, reference)`."""
     table: Table = Table()

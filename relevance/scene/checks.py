@@ -1,0 +1,66 @@
+"""How the parts of a scene are checked: pydantic dataclasses whose error is one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, TypeVar, dataclass_transform
+
+from pydantic import ConfigDict, Field, ValidationError
+from pydantic.dataclasses import dataclass
+
+from relevance.errors import RelevanceError
+from relevance.scene.words import shown
+
+C = TypeVar("C", bound=type)
+
+
+class SceneError(RelevanceError):
+    """A scene or goal that cannot be: says which field, what it holds, what was expected."""
+
+
+@dataclass_transform(
+    kw_only_default=True, frozen_default=True, field_specifiers=(dataclasses.field, Field)
+)
+def checked(cls: C) -> C:
+    """Make a class of annotated fields a frozen dataclass.
+
+    Fields that are unknown, of another type, NaN or infinite are refused with a SceneError.
+    """
+    config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    made: Any = dataclass(cls, frozen=True, slots=True, kw_only=True, config=config)
+    check = made.__init__
+
+    @functools.wraps(check)
+    def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
+        try:
+            check(self, *args, **kwargs)
+        except ValidationError as error:
+            raise SceneError(f"{cls.__name__}: {first_error(error)}") from None
+
+    made.__init__ = __init__
+    return made
+
+
+_SAID_BETTER = {
+    "unexpected_keyword_argument": "unknown field",
+    "dataclass_type": "expected an object",
+    "tuple_type": "expected a list",
+}
+_TRIED = ("function-after[", "tuple[", "str")
+
+
+def first_error(error: ValidationError) -> str:
+    """`field: what was expected (found what)`, of the first thing that is wrong."""
+    errors = error.errors(include_url=False)
+    # A misspelt field is missing and unknown at once: the unknown one says more.
+    first = next((e for e in errors if e["type"] == "unexpected_keyword_argument"), errors[0])
+    # Where a name or a list of names is expected, the path says which was tried.
+    parts = [str(part) for part in first["loc"] if not str(part).startswith(_TRIED)]
+    field = shown(".".join(parts), 200)[1:-1]
+    message = _SAID_BETTER.get(first["type"], first["msg"].removeprefix("Value error, "))
+    text = ": ".join(part for part in (field, message) if part)
+    found = first["input"]
+    if not isinstance(found, str | int | float) or shown(found) in text:
+        return text
+    return text if message == "unknown field" else f"{text} (found {shown(found)})"
