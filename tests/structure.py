@@ -1,6 +1,6 @@
 """What imports what: the reader behind `test_structure.py`, and the drawing in CONTRIBUTING.md.
 
-    python tests/structure.py    # prints the drawing (Mermaid), as `make drawing` does
+python tests/structure.py    # prints the drawing (Mermaid), as `make drawing` does
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from pydantic import Field, TypeAdapter, model_validator
 from relevance.hashing import content_hash
 from relevance.scene.boxes import Box, Camera, Light, Robot, Table, wrapped
 from relevance.scene.checks import SceneError, checked
-from relevance.scene.contacts import check_boxes
+from relevance.scene.contacts import check_boxes, with_all_supports
 from relevance.scene.plans import Pose
 from relevance.scene.predicates import Goal
 from relevance.scene.projection import project, vertices
@@ -49,6 +49,8 @@ class Scene:
             object.__setattr__(
                 self, "objects", tuple(replace(box, yaw=turn) for box, turn in pairs)
             )
+        objects = tuple(with_all_supports(box, self.objects) for box in self.objects)
+        object.__setattr__(self, "objects", objects)
         check_boxes(self.objects, self.table, self.robot)
         _check_camera(self.camera, self.objects)
         object.__setattr__(self, "goals", tuple(str(self.goal(text)) for text in self.goals))
