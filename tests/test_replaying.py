@@ -11,6 +11,7 @@ import numpy as np
 import pybullet
 import pytest
 
+from relevance.robot import panda_urdf
 from relevance.scene import (
     Action,
     Box,
@@ -22,7 +23,7 @@ from relevance.scene import (
     SceneError,
     Table,
 )
-from relevance.simulation import panda_urdf, replay
+from relevance.simulation import replay
 
 GRASP = 11  # the URDF's grasp target, between the finger pads
 REST = np.array([0.0, -0.3, 0.0, -2.2, 0.0, 2.0, 0.8])

@@ -16,6 +16,7 @@ ORDER = (
     "hashing",
     "configs",
     "counters",
+    "robot",
     "scene",
     "store",
     "sampling",

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit
 
+from relevance.robot import GRASPABLE_EDGE as GRASPABLE_EDGE
 from relevance.sampling.projection import pinhole
 from relevance.sampling.rows import (
     ROW,
@@ -31,8 +32,6 @@ from relevance.scene import GAP, Box
 if TYPE_CHECKING:
     from relevance.sampling.scenes import SceneConfig
 
-GRASPABLE_EDGE = 0.07
-"""Longest footprint edge that the hand (opening 8 cm) takes with room to spare, m."""
 COMMON_RADIUS = 0.0275
 """Half the shorter footprint edge of a common subject, m."""
 

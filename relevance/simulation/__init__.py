@@ -11,7 +11,7 @@ from relevance.simulation.rendering import (
     Rendering,
     rejects,
 )
-from relevance.simulation.replaying import MAX_PENETRATION, Replay, panda_urdf, replay
+from relevance.simulation.replaying import MAX_PENETRATION, Replay, replay
 
 __all__ = [
     "MAX_PENETRATION",
@@ -21,7 +21,6 @@ __all__ = [
     "Renderer",
     "Rendering",
     "Replay",
-    "panda_urdf",
     "rejects",
     "replay",
 ]
