@@ -44,7 +44,7 @@ def necessary(scene: Scene, found: Mapping[str, Any], config: PlannerConfig) -> 
             verdicts[name] = Verdict(relevant=False, because="the plan does without it")
             continue
         others = frozenset(scene.names) - {name}
-        without = plan(scene, goal, config=config, movable=others)
+        without = plan(scene, goal, config=config, movable=others, replay=False)
         if without.status == "solved" and without.check_ok:
             moves = ", ".join(without.moved)
             verdicts[name] = Verdict(relevant=False, because=f"a plan without it moves {moves}")

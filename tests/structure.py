@@ -19,6 +19,7 @@ ORDER = (
     "hashing",
     "configs",
     "counters",
+    "robot",
     "scene",
     "store",
     "sampling",

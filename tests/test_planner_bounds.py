@@ -12,32 +12,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relevance import _kernel_cache
-from relevance.planner import keyframes, path, placement
+from relevance.planner import path, pose
+from relevance.planner.grasps import bodies, grasps
 from relevance.planner.kernels import native
-from relevance.planner.kernels.boxes import banded_solve, separation
-from relevance.planner.kernels.native import call
-from relevance.planner.kinematics import (
-    ARM,
-    FRAME,
-    LINKS,
-    arm_at,
-    hand_down,
-    panda,
-    reach_interval,
+from relevance.planner.kernels.boxes import (
+    banded_solve,
+    separation,
 )
-from relevance.planner.placement import FOUND, NONE
+from relevance.planner.kernels.kinematics import FRAME, arm_at, functions, hand_down, reach_interval
+from relevance.planner.kernels.native import call
+from relevance.planner.pose import FOUND, NONE
+from relevance.robot import ARM, LINKS, panda, panda_urdf
 from relevance.scene import Box
 from relevance.scene.geometry import UPRIGHT, rectangle_gap, upright
-from relevance.simulation import panda_urdf
 
 BASE = np.array([-0.48, 0.0, 0.0, 0.0])
 
 
 def frames_at(q, base=BASE):
-    arm = panda()
-    arm.frames.x[:] = np.r_[q, base]
-    call(arm.frames.handle)
-    return arm.frames.y.copy().reshape(len(LINKS), FRAME)
+    functions().frames.x[:] = np.r_[q, base]
+    call(functions().frames.handle)
+    return functions().frames.y.copy().reshape(len(LINKS), FRAME)
 
 
 def obstacle_rows(numbers):
@@ -112,12 +107,12 @@ def test_frame_jacobians_equal_finite_differences():
 
 
 def test_grasp_jacobians_equal_finite_differences():
-    arm, rng, h = panda(), np.random.default_rng(2), 1e-6
+    rng, h = np.random.default_rng(2), 1e-6
 
     def residual(x):
-        arm.grasp.x[:] = x
-        call(arm.grasp.handle)
-        return arm.grasp.y.copy()
+        functions().grasp.x[:] = x
+        call(functions().grasp.handle)
+        return functions().grasp.y.copy()
 
     for _ in range(10):
         x = np.r_[random_q(rng), BASE, rng.uniform(-0.5, 0.5, 4)]
@@ -137,9 +132,9 @@ def test_hand_down_solves_the_grasp_exactly():
         if not hand_down(target, BASE, arm.lower, arm.upper, q):
             continue
         reached += 1
-        arm.grasp.x[:] = np.r_[q, BASE, target]
-        call(arm.grasp.handle)
-        assert np.abs(arm.grasp.y[:6]).max() < 1e-9
+        functions().grasp.x[:] = np.r_[q, BASE, target]
+        call(functions().grasp.handle)
+        assert np.abs(functions().grasp.y[:6]).max() < 1e-9
         assert frames_at(q)[2, 3:12].reshape(3, 3)[2, 2] < -0.999, "the hand points down"
     assert reached > 200
 
@@ -242,7 +237,7 @@ def test_banded_solve_equals_dense():
 
 def test_path_gradient_equals_finite_differences():
     arm, rng = panda(), np.random.default_rng(6)
-    body = keyframes.bodies(0.03)
+    body = bodies(0.03)
     obstacles = obstacle_rows(
         [[0.1, 0.0, 0.06, 0.3, 0.05, 0.04, 0.06], [0, 0, -0.05, 0, 0.4, 0.6, 0.05]]
     )
@@ -292,7 +287,7 @@ def test_smoothness_is_the_hessian_of_the_cost():
 def test_pairs_called_clear_are_clear_at_every_substep():
     """The dense check skips pairs by a bound on the motion; sampled finely, none comes close."""
     arm, at, rng = panda(), arm_at(BASE), np.random.default_rng(8)
-    body = keyframes.bodies(0.03, (np.array([0, 0, 0.12]), np.array([0.03, 0.02, 0.05])))
+    body = bodies(0.03, (np.array([0, 0, 0.12]), np.array([0.03, 0.02, 0.05])))
     obstacles = obstacle_rows(
         [[0.1, 0.0, 0.06, 0.3, 0.05, 0.04, 0.06], [0, 0, -0.05, 0, 0.4, 0.6, 0.05]]
     )
@@ -318,7 +313,7 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
     for _ in range(60):
         size = rng.uniform(0.04, 0.07, 3)
         box = Box(name="b", size=tuple(size), position=(0, 0, size[2] / 2), color=(1, 0, 0))
-        grasp = placement.grasps(box)[0]
+        grasp = grasps(box)[0]
         count = rng.integers(3, 9)
         obstacles = obstacle_rows(
             np.c_[
@@ -331,12 +326,12 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
         )
         region = np.array([0.0, 0.0, 0.2, 0.05, 0.03])
         near, far = reach_interval(0.15)
-        pose = np.zeros(3)
+        at = np.zeros(3)
         common = (0.0, grasp.parts, obstacles, table, BASE, near, far)
-        status, _ = placement.find_pose(region, np.zeros(2), *common, 0.0, pose)
+        status, _ = pose.find_pose(region, np.zeros(2), *common, 0.0, at)
         c, s = math.cos(0.2), math.sin(0.2)
         grid = max(
-            placement.slack(c * x - s * y, s * x + c * y, angle, *common)
+            pose.slack(c * x - s * y, s * x + c * y, angle, *common)
             for x in np.linspace(-0.05, 0.05, 15)
             for y in np.linspace(-0.03, 0.03, 9)
             for angle in np.linspace(0, math.pi, 24, endpoint=False)
@@ -346,8 +341,8 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
             assert grid < 0
         if status == FOUND:
             found += 1
-            assert placement.slack(*pose, *common) >= 0
-            local = np.array([[c, s], [-s, c]]) @ pose[:2]
+            assert pose.slack(*at, *common) >= 0
+            local = np.array([[c, s], [-s, c]]) @ at[:2]
             assert (np.abs(local) <= [0.05, 0.03]).all()
     assert refused > 3
     assert found > 3

@@ -13,6 +13,7 @@ import pybullet
 import pytest
 
 from relevance.planner import plan
+from relevance.robot import panda_urdf
 from relevance.scene import (
     PREDICATES,
     Action,
@@ -27,7 +28,7 @@ from relevance.scene import (
     goal_holds,
     read_scenes,
 )
-from relevance.simulation import panda_urdf, replay
+from relevance.simulation import replay
 
 CASES = Path(__file__).parent / "cases"
 

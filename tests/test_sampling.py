@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relevance.planner import plan
+from relevance.robot import GRASPABLE_EDGE
 from relevance.sampling import (
-    GRASPABLE_EDGE,
     GoalConfig,
     Randomisation,
     SceneConfig,

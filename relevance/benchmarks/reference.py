@@ -15,8 +15,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from relevance.planner.kinematics import reach_interval
-from relevance.planner.placement import LIFT, Grasp, grasps
+from relevance.planner.grasps import Grasp, grasps
+from relevance.planner.kernels.kinematics import reach_interval
+from relevance.planner.pose import LIFT
 from relevance.scene import Box, Goal, Scene
 
 CLEARANCE = 0.003

@@ -77,12 +77,12 @@ def measure_stability(
 
 def jittered(task: Task, seed: int, config: PlannerConfig) -> Iterator[Jittered]:
     """Plan a task as it is, again, and JITTERS times with its boxes moved."""
-    first = plan(task.scene, task.goal, config=config)
-    again = plan(task.scene, task.goal, config=config)
+    first = plan(task.scene, task.goal, config=config, replay=False)
+    again = plan(task.scene, task.goal, config=config, replay=False)
     queries = [n for n in task.scene.names if n not in (task.goal.subject, task.goal.reference)]
     for draw in range(JITTERS):
         rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, draw, task.index]))
-        moved = plan(jitter(task.scene, rng), task.goal, config=config)
+        moved = plan(jitter(task.scene, rng), task.goal, config=config, replay=False)
         comparable = first.status == moved.status == "solved"
         flips = [name for name in queries if (name in first.moved) != (name in moved.moved)]
         yield Jittered(

@@ -97,7 +97,7 @@ def _work(
             f"ours and {against}",
             lambda progress: benchmarks.measure_against(
                 drawn,
-                lambda scene, goal: plan_rai(scene, goal, config=config),
+                lambda scene, goal: plan_rai(scene, goal, config=config, replay=False),
                 name=against,
                 progress=progress,
             ),

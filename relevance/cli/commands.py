@@ -189,8 +189,7 @@ def _report(_: Preset) -> Callable[..., int]:
 
 
 def _plan(_: Preset) -> Callable[..., int]:
-    from relevance.planner import PlannerConfig
-    from relevance.planner.search import Mode
+    from relevance.planner import GUIDES, PlannerConfig
     from relevance.scene import SceneError, read_scenes
 
     default = PlannerConfig()
@@ -201,7 +200,7 @@ def _plan(_: Preset) -> Callable[..., int]:
         json: tyro.conf.FlagCreatePairsOff[bool] = False,
         planner: Literal["ours", "rai"] = "ours",
         search: Literal["tree", "informed"] = "informed",
-        guide: Mode = "none",
+        guide: Literal[tuple(GUIDES)] = "none",  # pyright: ignore[reportInvalidTypeForm]
         checkpoint: OptionalPath = None,
         beta: float = 0.0,
         limit: int = default.node_limit,
@@ -243,11 +242,11 @@ def _plan(_: Preset) -> Callable[..., int]:
         if planner == "rai":
             from relevance.planner.rai.planner import RaiConfig, plan_rai
 
-            solve = functools.partial(plan_rai, config=RaiConfig(seconds=seconds))
+            solve = functools.partial(plan_rai, config=RaiConfig(seconds=seconds), replay=False)
         else:
             from relevance.planner import plan
 
-            solve = functools.partial(plan, config=config)
+            solve = functools.partial(plan, config=config, replay=False)
 
         guidance = None
         if checkpoint:

@@ -35,7 +35,6 @@ from relevance.planner import (
     Scorer,
     plan,
 )
-from relevance.planner.search import Mode
 from relevance.scene import PREDICATES, Goal, Scene
 from relevance.store import SPLITS, Dataset
 
@@ -53,12 +52,12 @@ class EvaluationError(RelevanceError):
 class EvaluationConfig:
     """What to rerun, and how often."""
 
-    guides: tuple[Mode, ...] = ("prune", "prune-then-full")
+    guides: tuple[str, ...] = ("prune", "prune-then-full")
     beta: float = 0.0
     """The working point: an object is kept iff score > -beta."""
     betas: tuple[float, ...] = (-2.0, 2.0, 4.0)
     """Further values at which `sweep_guide` is rerun, on the first `sweep_tasks` tasks."""
-    sweep_guide: Mode = "prune"
+    sweep_guide: str = "prune"
     tasks: int = 40
     """Tasks per predicate, drawn by the hash of their id; 0 takes all."""
     sweep_tasks: int = 20
@@ -193,7 +192,7 @@ def load_scorer(checkpoint: str | Path) -> NetworkScorer:
 
 
 def load_guide(
-    checkpoint: str | Path, *, mode: Mode = "prune-then-full", beta: float = 0.0
+    checkpoint: str | Path, *, mode: str = "prune-then-full", beta: float = 0.0
 ) -> Guide:
     """A guide for `plan` from a checkpoint file."""
     return Guide(scorer=load_scorer(checkpoint), mode=mode, beta=beta)
@@ -396,13 +395,13 @@ def compare(
     """
     scores, rows = scorer.scores(scene, goal), []
     for search in config.searches:
-        guides: list[tuple[Mode, float]] = [(guide, config.beta) for guide in config.guides]
+        guides: list[tuple[str, float]] = [(guide, config.beta) for guide in config.guides]
         if swept and search == config.searches[0]:
-            sweep: Mode = config.sweep_guide
+            sweep: str = config.sweep_guide
             guides.extend((sweep, beta) for beta in (config.beta, *config.betas))
-        runs: list[tuple[Mode, float] | None] = [None, *dict.fromkeys(guides)]
+        runs: list[tuple[str, float] | None] = [None, *dict.fromkeys(guides)]
         planner = replace(config.planner, search=search)
-        timed: dict[tuple[Mode, float] | None, list[_Run]] = defaultdict(list)
+        timed: dict[tuple[str, float] | None, list[_Run]] = defaultdict(list)
         for repeat in range(config.repeats):
             for position in range(len(runs)):
                 which = runs[(position + turn + repeat) % len(runs)]
@@ -446,7 +445,7 @@ def _timed(scene: Scene, goal: Goal, planner: PlannerConfig, guide: Guide | None
     if isinstance(scorer, NetworkScorer):
         scorer.forget()
     start = time.process_time()
-    result = plan(scene, goal, config=planner, guide=guide)
+    result = plan(scene, goal, config=planner, guide=guide, replay=False)
     seconds = time.process_time() - start
     inference = scorer.seconds if isinstance(scorer, NetworkScorer) else 0.0
     return _Run(result=result, seconds=seconds, inference=inference)

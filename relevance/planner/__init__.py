@@ -1,27 +1,35 @@
 """Logic-Geometric Programming over pick and place: `plan(scene, goal)`."""
 
-from relevance.planner.problem import Counts, Seconds
-from relevance.planner.search import (
-    GUIDES,
+from relevance.planner.checking import penetration
+from relevance.planner.guides import GUIDES, Guide, GuideError, Mode, Scorer
+from relevance.planner.rai.planner import RaiConfig
+from relevance.planner.result import (
     PLANNER_VERSION,
-    Guide,
+    PLANNERS,
+    Counts,
+    Planner,
     PlannerConfig,
     PlanResult,
-    Scorer,
-    penetration,
-    plan,
-    warm_up,
+    Seconds,
+    Status,
 )
+from relevance.planner.search import plan, warm_up
 
 __all__ = [
     "GUIDES",
+    "PLANNERS",
     "PLANNER_VERSION",
     "Counts",
     "Guide",
+    "GuideError",
+    "Mode",
     "PlanResult",
+    "Planner",
     "PlannerConfig",
+    "RaiConfig",
     "Scorer",
     "Seconds",
+    "Status",
     "penetration",
     "plan",
     "warm_up",

@@ -12,21 +12,24 @@ Variables: q (2m, 7), one per switch (pick and place of each of m moved boxes in
 from __future__ import annotations
 
 import math
-from functools import cache
+import time
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from relevance.planner.grasps import bodies, carried, pick_target
 from relevance.planner.kernels.boxes import (
-    Bodies,
     body_pose,
     dense_solve,
     near,
     point_gradient,
     separation,
 )
-from relevance.planner.kinematics import ARM, FRAME, HAND, look_at_frames, look_at_grasp, panda
+from relevance.planner.kernels.kinematics import FRAME, hand_down, look_at_frames, look_at_grasp
+from relevance.planner.pose import Placement, interval, moved_box
+from relevance.planner.problem import Problem
+from relevance.robot import ARM, HOME, panda
 from relevance.scene.geometry import UPRIGHT, upright
 
 CLEARANCE = 0.0025
@@ -74,30 +77,82 @@ class Switches(NamedTuple):
     so that the hand can rise from it."""
 
 
-def bodies(opening: float, carried: tuple | None = None) -> Bodies:
-    """Arm, hand and fingers at this opening; last the carried box (centre, half), if any."""
-    shut, sides = _shut_hand()
-    count = len(sides) - (carried is None)
-    link, centre, half, radius = (rows[:count].copy() for rows in shut)
-    centre[:, 1] += opening * sides[:count]
-    if carried is not None:
-        centre[-1], half[-1] = carried
-        radius[-1] = math.hypot(*half[-1])
-    return Bodies(link, centre, half, radius)
+class KeyframeBound:
+    """Solves the keyframe NLP of an order of moves."""
 
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
 
-@cache
-def _shut_hand() -> tuple[Bodies, np.ndarray]:
-    """Arm, hand, fingers at opening 0 and room for a box; and which way opening moves each in y."""
-    arm = panda()
-    rows, sides = list(arm.arm), [0.0] * len(arm.arm)
-    for low, high in arm.finger:
-        for side in (1.0, -1.0):
-            rows.append((HAND, (low + high) / 2 * [1.0, side, 1.0], (high - low) / 2))
-            sides.append(side)
-    rows.append((HAND, np.zeros(3), np.zeros(3)))
-    link, centre, half = (np.array(column) for column in zip(*rows, strict=True))
-    return Bodies(link, centre, half, np.sqrt((half**2).sum(1))), np.array([*sides, 0.0])
+    def solve(
+        self, order: tuple[str, ...], placements: list[Placement]
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Configurations (2m, 7) and placement poses (m, 3), or None."""
+        began = time.process_time()
+        self.problem.counts.keyframe += 1
+        found = self._solve(order, placements)
+        self.problem.seconds.keyframe += time.process_time() - began
+        return found
+
+    def _solve(
+        self, order: tuple[str, ...], placements: list[Placement]
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        arm, at, problem, m = panda(), self.problem.arm, self.problem, len(order)
+        base = problem.scene.robot.base
+        moved = np.full(len(problem.obstacles), -1)
+        stands = np.ones((2 * m, len(problem.obstacles)), np.bool_)
+        supports = np.full(m, len(problem.boxes))  # the table
+        widest = len(arm.arm) + 2 * len(arm.finger) + 1
+        link, n_bodies = np.zeros((2 * m, widest), np.int64), np.zeros(2 * m, np.int64)
+        centre, half = np.zeros((2 * m, widest, 3)), np.zeros((2 * m, widest, 3))
+        radius = np.zeros((2 * m, widest))
+        pick, place_z, turn = np.zeros((m, 4)), np.zeros(m), np.zeros((m, 2))
+        bounds = np.zeros((m, 4))
+        x = np.zeros(17 * m)
+        p0, weight = np.zeros(3 * m), np.zeros(3 * m)
+        reference = problem.reference
+        if reference.name in order:
+            reference = moved_box(reference, placements[order.index(reference.name)])
+        for j, (name, place) in enumerate(zip(order, placements, strict=True)):
+            box, grasp = problem.boxes[name], place.grasp
+            bottom = 0.0
+            if name == problem.goal.subject and problem.goal.predicate.stacked:
+                supports[j], bottom = problem.index[reference.name], reference.top
+            moved[problem.index[name]] = j
+            pick[j] = pick_target(box, grasp)
+            place_z[j] = bottom + box.size[2] / 2 + grasp.above
+            turn[j] = grasp.axis * math.pi / 2, bottom + box.size[2] / 2
+            p0[3 * j : 3 * j + 3] = place.pose
+            for k in (2 * j, 2 * j + 1):
+                held = carried(box, grasp) if k % 2 else None
+                body = bodies(grasp.opening, held)
+                n_bodies[k] = count = len(body.link)
+                link[k, :count], centre[k, :count], half[k, :count], radius[k, :count] = body
+                stands[k, problem.index[name]] = False
+            c, s = abs(math.cos(place.pose[2])), abs(math.sin(place.pose[2]))
+            along, across = grasp.parts[0, 1], grasp.parts[0, 2]
+            bounds[j, :2] = problem.table
+            bounds[j, :2] -= c * along + s * across, s * along + c * across
+            bounds[j, 2:] = interval(base, bottom, box, grasp)
+            target = np.array([*place.pose[:2], place_z[j], place.pose[2]])
+            for k, t in ((2 * j, pick[j]), (2 * j + 1, target)):
+                q = x[k * ARM : (k + 1) * ARM]
+                if not hand_down(t, at.base, at.lower, at.upper, q):
+                    return None
+        x[14 * m :] = p0
+        switches = Switches(
+            HOME, pick, place_z, turn, link, centre, half, radius, n_bodies, problem.obstacles,
+            stands, moved, supports, problem.goal_region(reference), bounds,
+        )  # fmt: skip
+        start = x.copy()
+        for stay in STAY:
+            weight[:] = stay
+            if reference.name in order:  # the subject's region was laid out around it
+                j = order.index(reference.name)
+                weight[3 * j : 3 * j + 3] = 1e6
+            x[:] = start
+            if solve(x, at, switches, p0, weight) <= TOLERANCE:
+                return x[: 14 * m].reshape(2 * m, ARM), x[14 * m :].reshape(m, 3)
+        return None
 
 
 @njit(cache=True)

@@ -10,10 +10,13 @@ Lagrangian on a banded system. Velocity limits are kept by the time between rows
 from __future__ import annotations
 
 import math
+import time
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
+from relevance.planner.grasps import bodies, carried, pick_target
 from relevance.planner.kernels.boxes import (
     banded_solve,
     body_pose,
@@ -22,7 +25,13 @@ from relevance.planner.kernels.boxes import (
     point_gradient,
     separation,
 )
-from relevance.planner.kinematics import ARM, FRAME, HAND, look_at_frames, look_at_grasp
+from relevance.planner.kernels.kinematics import FRAME, finger_turn, look_at_frames, look_at_grasp
+from relevance.planner.logic import actions
+from relevance.planner.pose import Placement
+from relevance.planner.problem import Problem
+from relevance.robot import ARM, HAND, HOME
+from relevance.scene import Phase, Pose
+from relevance.scene.geometry import upright
 
 ROWS = 20
 """Steps of a motion; it has ROWS + 1 rows."""
@@ -50,6 +59,105 @@ TOLERANCE = 4e-4
 """Largest violation of a solved problem, m or rad."""
 _WIDTH = 3 * ARM
 _EXCHANGES = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """A solved sequence."""
+
+    order: tuple[str, ...]
+    phases: tuple[Phase, ...]
+    final: dict[str, Pose]
+    cost: float
+    """Squared joint accelerations, summed over rows, rad^2."""
+    max_penetration: float
+    """Deepest penetration at the sub-steps of the dense check, m."""
+
+
+class PathBound:
+    """Finds the motions through the keyframes of an order of moves, densely checked."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+
+    def solve(
+        self,
+        order: tuple[str, ...],
+        placements: list[Placement],
+        q: np.ndarray,
+        poses: np.ndarray,
+    ) -> Motion | None:
+        """Motions through configurations q (2m, 7) and poses (m, 3); None where one fails."""
+        began = time.process_time()
+        found = self._solve(order, placements, q, poses)
+        self.problem.seconds.path += time.process_time() - began
+        return found
+
+    def _solve(
+        self,
+        order: tuple[str, ...],
+        placements: list[Placement],
+        q: np.ndarray,
+        poses: np.ndarray,
+    ) -> Motion | None:
+        problem, arm = self.problem, self.problem.arm
+        obstacles = problem.obstacles.copy()
+        there = np.ones(len(obstacles), np.bool_)
+        phases: list[Phase] = []
+        final: dict[str, Pose] = {}
+        sequence = actions(problem.goal, order)
+        cost, worst = 0.0, 0.0
+        at, leave, leaving = HOME, np.zeros(4), False
+        for j, (name, place) in enumerate(zip(order, placements, strict=True)):
+            box, grasp, i = problem.boxes[name], place.grasp, problem.index[name]
+            last = name == problem.goal.subject
+            on = problem.goal.reference if last and problem.goal.predicate.stacked else None
+            bottom = 0.0
+            if on is not None:
+                bottom = obstacles[problem.index[on], 2] + obstacles[problem.index[on], 6]
+            take = pick_target(box, grasp)
+            z = bottom + box.size[2] / 2 + grasp.above
+            put = np.array([poses[j, 0], poses[j, 1], z, poses[j, 2]])
+            free = bodies(grasp.opening)
+            held = bodies(grasp.closed, carried(box, grasp))
+            for k, (arrive, body, opening) in enumerate(
+                ((take, free, grasp.opening), (put, held, grasp.closed))
+            ):
+                problem.counts.path += 1
+                there[i] = k == 0
+                X = np.empty((ROWS + 1, ARM))
+                X[0], X[-1] = at, q[2 * j + k]
+                depth, effort, dt = motion(X, arm, leave, leaving, arrive, body, obstacles[there])
+                if depth < 0:
+                    return None
+                action, in_hand = sequence[2 * j + k], name if k else None
+                phases.append(Phase(action=action, q=X, dt=dt, opening=opening, carried=in_hand))
+                cost, worst = cost + effort, max(worst, depth)
+                at, leave, leaving = X[-1], arrive, True
+            there[i] = True
+            turned = finger_turn(arm, q[2 * j], q[2 * j + 1])
+            yaw = (box.yaw + turned + math.pi) % (2 * math.pi) - math.pi
+            position = (float(poses[j, 0]), float(poses[j, 1]), bottom + box.size[2] / 2)
+            put_down(obstacles[i], position, yaw)
+            final[name] = Pose(position=position, yaw=yaw, on=on)
+            X = np.empty((2 * VERTICAL + 1, ARM))
+            X[0] = at
+            depth, effort, dt = retreat(X, arm, put, free, obstacles[there])
+            if not 0 <= depth <= ALLOWED:
+                return None
+            phases.append(Phase(action=None, q=X, dt=dt, opening=grasp.opening, carried=None))
+            cost, worst = cost + effort, max(worst, depth)
+            at, leaving = X[-1], False
+        return Motion(
+            order=order, phases=tuple(phases), final=final, cost=cost, max_penetration=worst
+        )
+
+
+def put_down(row: np.ndarray, position: tuple[float, float, float], yaw: float) -> None:
+    """Stand the box of an obstacle row (UPRIGHT,) elsewhere."""
+    x, y, z = position
+    hx, hy, hz = row[4:7]
+    upright(x, y, z, yaw, hx, hy, hz, row)
 
 
 @njit(cache=True)

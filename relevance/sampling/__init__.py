@@ -17,7 +17,6 @@ row's hash.
 from relevance.sampling.goals import sample_goals
 from relevance.sampling.scenes import sample_scene
 from relevance.sampling.settings import (
-    GRASPABLE_EDGE,
     SAMPLER_VERSION,
     GoalConfig,
     Randomisation,
@@ -25,7 +24,6 @@ from relevance.sampling.settings import (
 )
 
 __all__ = [
-    "GRASPABLE_EDGE",
     "SAMPLER_VERSION",
     "GoalConfig",
     "Randomisation",

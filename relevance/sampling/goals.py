@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from relevance.counters import generator
-from relevance.sampling.settings import GRASPABLE_EDGE, GoalConfig
+from relevance.robot import GRASPABLE_EDGE
+from relevance.sampling.settings import GoalConfig
 from relevance.scene import Goal, Predicate, Scene, goal_holds
 
 _DEFAULT = GoalConfig()

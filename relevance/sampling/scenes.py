@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from relevance.counters import generator
+from relevance.robot import GRASPABLE_EDGE
 from relevance.sampling.colors import draw_colors
 from relevance.sampling.looks import draw_camera, draw_light, draw_table
-from relevance.sampling.settings import GRASPABLE_EDGE, SceneConfig
+from relevance.sampling.settings import SceneConfig
 from relevance.sampling.standing import Standing
 from relevance.scene import GAP, Box, Color, Scene
 from relevance.scene.geometry import packed

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from relevance.configs import config
 from relevance.hashing import content_hash
+from relevance.robot import GRASPABLE_EDGE
 from relevance.sampling.colors import MOST
 from relevance.scene import FAMILIES, Camera, Light, Robot, Table, pinhole
 from relevance.scene.contacts import check_robot
@@ -17,9 +18,6 @@ from relevance.scene.contacts import check_robot
 SAMPLER_VERSION = "1"
 """Raised when equal settings and counters come to give another scene or other goals: a default,
 a draw or its order changed. Stored scenes keep the version that drew them."""
-
-GRASPABLE_EDGE = 0.07
-"""Longest footprint edge that the hand (opening 8 cm) takes with room to spare, m."""
 
 Span = tuple[float, float]
 Share = Annotated[float, Field(ge=0, le=1)]

@@ -12,7 +12,7 @@ from relevance.simulation.rendering import (
     Rendering,
     rejects,
 )
-from relevance.simulation.replaying import MAX_PENETRATION, Replay, panda_urdf, replay
+from relevance.simulation.replaying import MAX_PENETRATION, Replay, replay
 
 __all__ = [
     "MAX_PENETRATION",
@@ -23,7 +23,6 @@ __all__ = [
     "Renderer",
     "Rendering",
     "Replay",
-    "panda_urdf",
     "rejects",
     "replay",
 ]

@@ -14,16 +14,15 @@ are exact on faces, and on edges too once their collision margin is set to almos
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
+from relevance.robot import panda_urdf
 from relevance.scene import CONTACT_TOLERANCE, Goal, Phase, Scene, goal_holds
 from relevance.simulation.bullet import pybullet
 
@@ -55,14 +54,6 @@ class Replay:
     """Deepest overlap of anything with anything, intended contacts aside, m, at least 0."""
     reason: str
     """The first thing that did not hold; empty when ok."""
-
-
-def panda_urdf() -> Path:
-    """The Panda's URDF that pybullet ships, found without importing its data package."""
-    spec = importlib.util.find_spec("pybullet_data")
-    if spec is None or spec.origin is None:
-        raise RuntimeError("pybullet_data is not installed; it comes with pybullet")
-    return Path(spec.origin).parent / "franka_panda" / "panda.urdf"
 
 
 def replay(scene: Scene, goal: Goal, phases: Sequence[Phase], *, substeps: int = 8) -> Replay:

@@ -1,1 +1,1 @@
-"""Inner loops: box distances, native calls and the solvers' linear algebra, in numba."""
+"""Inner loops: box distances, the arm's kinematics, native calls and linear algebra, in numba."""

@@ -27,26 +27,25 @@ import threading
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
+from relevance.configs import config
 from relevance.errors import RelevanceError
-from relevance.planner.kinematics import ARM, HOME, LINKS, panda
+from relevance.planner.guides import Guide, ask, rounds
 from relevance.planner.path import SPEED, STEP
-from relevance.planner.problem import Counts, Seconds
-from relevance.planner.search import Guide, PlanResult, rounds
-from relevance.scene import (
-    Action,
-    Box,
-    Goal,
-    Phase,
-    Pose,
-    Scene,
-    SceneError,
-    footprint_gap,
-    goal_holds,
+from relevance.planner.result import (
+    PLANNERS,
+    Counts,
+    PlanResult,
+    Seconds,
+    movable_names,
+    replayed,
 )
+from relevance.robot import ARM, HOME, LINKS, panda
+from relevance.scene import Action, Box, Goal, Phase, Pose, Scene, footprint_gap, goal_holds
 
 ROUND = 0.01
 """Corner radius of boxes against the hand, m; rai's solver needs it to slide along edges."""
@@ -113,20 +112,14 @@ class PeerError(RelevanceError):
     """The other planner cannot run here: says what is missing and how to get it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@config
 class RaiConfig:
-    """Settings of rai as a planner; raises ValueError for impossible ones."""
+    """Settings of rai as a planner."""
 
-    seconds: float = 30.0
+    seconds: Annotated[float, Field(gt=0)] = 30.0
     """CPU seconds for a goal; then the result is `limit`."""
-    rounds: int = 3
+    rounds: Annotated[int, Field(ge=1)] = 3
     """How often rai starts afresh, with another seed, when it ran out of action sequences."""
-
-    def __post_init__(self) -> None:
-        if not self.seconds > 0:
-            raise ValueError(f"seconds {self.seconds}: expected more than 0")
-        if self.rounds < 1:
-            raise ValueError(f"rounds {self.rounds}: expected at least 1")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,38 +148,78 @@ def plan_rai(
     scene: Scene,
     goal: Goal | str,
     *,
-    config: RaiConfig = RaiConfig(),
+    config: RaiConfig | None = None,
     guide: Guide | None = None,
     movable: Collection[str] | None = None,
+    replay: bool = True,
 ) -> PlanResult:
     """Plan with rai's LGP solver in a subprocess; the result is of the same type as `plan`'s.
 
-    A guide restricts what rai may move (`order` has no effect on it). `seconds.total` is the
-    CPU time of the subprocess without loading Python and rai; counts are rai's waypoint
-    problems (keyframe), motif samples (pose), motions (path) and action sequences (nodes).
-    `check_ok` stays False: rai's plans are for the replay to judge. Raises PeerError where rai
-    is missing, SceneError for an unknown predicate or object.
+    A guide restricts what rai may move (`order` has no effect on it); its last round has the
+    whole seconds. `seconds.total` is the CPU time of the subprocess without loading Python and
+    rai; counts are rai's waypoint problems (keyframe), motif samples (pose), motions (path) and
+    action sequences (nodes). `check_ok` stays False: rai's plans are for the replay to judge.
+    Raises PeerError where rai is missing, SceneError for an unknown predicate or object.
     """
     require_rai()
-    goal = scene.goal(goal)
-    everything = frozenset(scene.names if movable is None else movable)
-    for name in everything - set(scene.names):
-        raise SceneError(f"movable: no object {name!r}, expected some of {', '.join(scene.names)}")
+    found = _plan(scene, scene.goal(goal), config or RaiConfig(), guide, movable)
+    return replayed(scene, found) if replay else found
+
+
+def _plan(
+    scene: Scene,
+    goal: Goal,
+    config: RaiConfig,
+    guide: Guide | None,
+    movable: Collection[str] | None,
+) -> PlanResult:
+    everything = movable_names(scene, movable)
     if goal_holds(scene.objects, goal, scene.robot):
         return PlanResult(
             goal=goal, status="solved", final={}, cost=0.0, counts=Counts(), seconds=Seconds()
         )
-    scores = None
-    if guide is not None and guide.mode != "none":
-        scores = guide.scorer.scores(scene, goal)
-    spent = _Spent()
-    result = None
-    for allowed in rounds(everything, goal, guide, scores):
-        result = _attempt(scene, goal, rai_problem(scene, goal, movable=allowed), config, spent)
+    scores = ask(guide, scene, goal)
+    *early, last = rounds(everything, goal, guide, scores).allowed
+    spent, end = _Spent(), config.seconds
+    for allowed in early:  # these share the seconds, the last round has them whole
+        problem = rai_problem(scene, goal, movable=allowed)
+        result = _attempt(scene, goal, problem, config, spent, end)
         if result.status == "solved":
+            return result
+        if spent.seconds.total >= end:
             break
-    assert result is not None
-    return result
+    end = spent.seconds.total + config.seconds
+    return _attempt(scene, goal, rai_problem(scene, goal, movable=last), config, spent, end)
+
+
+class Rai:
+    """rai, as the registry of planners has it."""
+
+    name = "rai"
+    Config = RaiConfig
+
+    def require(self) -> None:
+        """Raise PeerError unless the `robotic` package is installed."""
+        require_rai()
+
+    def warm_up(self) -> None:
+        """Nothing to do: rai's loading is not counted."""
+
+    def plan(
+        self,
+        scene: Scene,
+        goal: Goal | str,
+        *,
+        config: RaiConfig | None = None,
+        guide: Guide | None = None,
+        movable: Collection[str] | None = None,
+        replay: bool = True,
+    ) -> PlanResult:
+        """As `plan_rai`."""
+        return plan_rai(scene, goal, config=config, guide=guide, movable=movable, replay=replay)
+
+
+PLANNERS.register(Rai.name, Rai())
 
 
 @dataclass(slots=True, kw_only=True)
@@ -198,11 +231,17 @@ class _Spent:
 
 
 def _attempt(
-    scene: Scene, goal: Goal, problem: RaiProblem, config: RaiConfig, spent: _Spent
+    scene: Scene,
+    goal: Goal,
+    problem: RaiProblem,
+    config: RaiConfig,
+    spent: _Spent,
+    end: float,
 ) -> PlanResult:
+    """Run rai until it finds a plan, or has used `end` seconds in all."""
     reason, exhausted = "", False
     for seed in range(config.rounds):
-        left = config.seconds - spent.seconds.total
+        left = end - spent.seconds.total
         if left <= 0:
             break
         found, reason, exhausted = _run(problem, seed, left, spent)

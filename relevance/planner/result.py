@@ -1,0 +1,140 @@
+"""What a planner is asked and what it answers; planners by name.
+
+A planner is an object of the `Planner` protocol, registered in PLANNERS; `rai` is one in a folder
+of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+
+from pydantic import Field
+
+from relevance.configs import config
+from relevance.planner.guides import Guide
+from relevance.registry import Registry
+from relevance.scene import Action, Goal, Phase, Pose, Scene, SceneError
+
+if TYPE_CHECKING:  # it imports pybullet, which planning does without
+    from relevance.simulation import Replay
+
+PLANNER_VERSION = "4"
+Status = Literal["solved", "infeasible", "limit", "refused"]
+"""`refused`: a plan was found, and the replay in the simulator does not confirm it."""
+
+
+@config
+class PlannerConfig:
+    """Settings that labels depend on; their hash is stored with every row."""
+
+    search: Literal["tree", "informed"] = "informed"
+    max_actions: Annotated[int, Field(ge=2, multiple_of=2)] = 6
+    node_limit: Annotated[int, Field(ge=1)] = 20_000
+    stop: Literal["first", "level"] = "level"
+    """Whether the first plan counts, or the cheapest of all plans that are as short."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Counts:
+    """Work done: nodes of the search tree, and calls of each bound."""
+
+    nodes: int = 0
+    pose: int = 0
+    keyframe: int = 0
+    path: int = 0
+
+
+@dataclass(slots=True, kw_only=True)
+class Seconds:
+    """CPU seconds, in all and by bound; guide is the time spent on scoring."""
+
+    total: float = 0.0
+    pose: float = 0.0
+    keyframe: float = 0.0
+    path: float = 0.0
+    guide: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanResult:
+    """What the planner found, and what it cost to find it."""
+
+    goal: Goal
+    status: Status
+    reason: str = ""
+    actions: tuple[Action, ...] = ()
+    moved: tuple[str, ...] = ()
+    """Moved objects, in order."""
+    alternatives: tuple[tuple[str, ...], ...] = ()
+    """Moved objects of every plan of this length that was found, in order; the best first."""
+    final: dict[str, Pose]
+    cost: float = math.nan
+    """Squared joint accelerations, summed over rows, rad^2."""
+    ambiguous: bool = False
+    """Whether another set of moved objects does as well, a bound was left open or a late one
+    refused, or a box standing 0.2 mm elsewhere might have changed a decision."""
+    counts: Counts
+    check_ok: bool = False
+    max_penetration: float = 0.0
+    """Deepest penetration at the sub-steps of the dense check, m."""
+    phases: tuple[Phase, ...] = ()
+    seconds: Seconds
+    replay: Replay | None = None
+    """The verdict of the replay in the simulator; None where the plan was not replayed."""
+
+
+class Planner(Protocol):
+    """A planner as the command line, benchmarks and evaluations see it."""
+
+    name: str
+    Config: Any
+    """Its class of settings; `Config()` are the defaults."""
+
+    def require(self) -> None:
+        """Raise RelevanceError where it cannot run here, with what is missing."""
+        ...
+
+    def warm_up(self) -> None:
+        """Load and compile all that it needs, so that no plan's time includes it."""
+        ...
+
+    def plan(
+        self,
+        scene: Scene,
+        goal: Goal | str,
+        *,
+        config: Any = None,
+        guide: Guide | None = None,
+        movable: Collection[str] | None = None,
+        replay: bool = True,
+    ) -> PlanResult:
+        """Find a plan; config None: the defaults, movable None: every object, else as `plan`."""
+        ...
+
+
+PLANNERS: Registry[Planner] = Registry("planner")
+"""Every planner by name."""
+
+
+def movable_names(scene: Scene, movable: Collection[str] | None) -> frozenset[str]:
+    """Names of what may be moved (None: all); raises SceneError for an unknown one."""
+    names = frozenset(scene.names if movable is None else movable)
+    for name in names - set(scene.names):
+        raise SceneError(f"movable: no object {name!r}, expected some of {', '.join(scene.names)}")
+    return names
+
+
+def replayed(scene: Scene, result: PlanResult) -> PlanResult:
+    """The result with the replay's verdict; a plan that the replay does not confirm is refused."""
+    if result.status != "solved":
+        return result
+    from relevance.simulation import replay
+
+    verdict = replay(scene, result.goal, result.phases)
+    if verdict.ok:
+        return replace(result, replay=verdict)
+    reason = f"the replay does not confirm the plan: {verdict.reason}"
+    return replace(result, status="refused", reason=reason, replay=verdict)
