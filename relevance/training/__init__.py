@@ -380,7 +380,7 @@ def train(
     path, unfinished = folder / f"{checkpoint_id}.pt", folder / f"{checkpoint_id}.state"
     if path.exists():
         _, meta = load_checkpoint(path)
-        _write_row(dataset, path, meta)
+        write_row(dataset, path, meta)
         return path
     examples = _load(dataset, "train", config, folder)
     if not examples.goals:
@@ -414,7 +414,7 @@ def train(
         "history": trainer.history,
     }
     _save(path, {"kind": "checkpoint", "meta": meta, "model": trainer.model.state_dict()})
-    _write_row(dataset, path, meta)
+    write_row(dataset, path, meta)
     unfinished.unlink(missing_ok=True)
     return path
 
@@ -441,8 +441,8 @@ def _threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _write_row(dataset: Dataset, path: Path, meta: Mapping[str, Any]) -> None:
-    """The checkpoint's row; nothing to do when it is there."""
+def write_row(dataset: Dataset, path: Path, meta: Mapping[str, Any]) -> None:
+    """Give a dataset the row of a checkpoint; nothing to do when it is there."""
     if dataset.has("checkpoints", name=meta["checkpoint_id"]):
         return
     inside = path.resolve().is_relative_to(dataset.path.resolve())
