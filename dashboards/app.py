@@ -4,7 +4,8 @@
 
 The dataset may also come from the environment variable RELEVANCE_DATASET, and from the field
 in the side bar. This file chooses dataset, split, checkpoint and beta for all pages; each page
-is a file of `pages/`, its questions are the SQL of `sql/`, and accuracies and intervals are
+is a file of `views/` (Streamlit would run the files of a folder `pages/` by themselves, without
+the choice, when a link leads straight to one), its questions are the SQL of `sql/`, and accuracies and intervals are
 computed as the report does. No icon is named anywhere: the browser would fetch it elsewhere.
 """
 
@@ -21,7 +22,7 @@ from relevance.report.style import seconds
 from relevance.store import SPLITS, Dataset
 
 PAGES = {"labels": "Labels", "accuracy": "Accuracy", "speed": "Speed-up", "scenes": "Scenes"}
-"""File in `pages/` and title; the first is the start page."""
+"""File in `views/` and title; the first is the start page."""
 
 
 def main() -> None:
@@ -29,7 +30,7 @@ def main() -> None:
     st.set_page_config(page_title="relevance", layout="wide")
     first = next(iter(PAGES))
     page = st.navigation(
-        [st.Page(f"pages/{n}.py", title=t, default=n == first) for n, t in PAGES.items()]
+        [st.Page(f"views/{n}.py", title=t, default=n == first) for n, t in PAGES.items()]
     )
     start = sys.argv[1] if len(sys.argv) > 1 else os.environ.get("RELEVANCE_DATASET", "data/demo")
     path = st.sidebar.text_input("Dataset folder", start, key="dataset")

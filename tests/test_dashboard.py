@@ -27,7 +27,7 @@ def page(monkeypatch):
     def run(dataset: Path, name: str = "labels") -> AppTest:
         monkeypatch.setattr("sys.argv", ["app.py", str(dataset)])
         app = AppTest.from_file(str(APP), default_timeout=60).run()
-        return app if name == "labels" else app.switch_page(f"pages/{name}.py").run()
+        return app if name == "labels" else app.switch_page(f"views/{name}.py").run()
 
     return run
 
@@ -142,6 +142,13 @@ def test_policy_of_the_labels_is_said(page) -> None:
     assert "Labels: policy found, which the checkpoint learned." in [
         caption.value for caption in page(root).sidebar.caption
     ]
+
+
+def test_a_link_straight_to_a_page_has_the_side_bar_too(page) -> None:
+    root, _ = evaluated()
+    assert not (APP.parent / "pages").exists()  # Streamlit would run its files by themselves
+    app = page(root, "scenes")
+    assert {box.key for box in app.sidebar.selectbox} == {"split", "checkpoint"}
 
 
 def test_every_query_is_asked_and_no_icon_is_fetched() -> None:
