@@ -4,9 +4,11 @@
 
 The dataset may also come from the environment variable RELEVANCE_DATASET, and from the field
 in the side bar. This file chooses dataset, split, checkpoint and beta for all pages; each page
-is a file of `views/` (Streamlit would run the files of a folder `pages/` by themselves, without
-the choice, when a link leads straight to one), its questions are the SQL of `sql/`, and accuracies and intervals are
-computed as the report does. No icon is named anywhere: the browser would fetch it elsewhere.
+is a file of `views/`, its questions are the SQL of `sql/`, and accuracies and intervals are
+computed as the report does.
+
+Streamlit would run the files of a folder `pages/` by themselves, without the choice, when a link
+leads straight to one. No icon is named anywhere: the browser would fetch it elsewhere.
 """
 
 from __future__ import annotations
