@@ -23,8 +23,8 @@ from relevance.errors import RelevanceError
 from relevance.report.style import seconds
 from relevance.store import SPLITS, Dataset
 
+# File in `views/` and title; the first is the start page.
 PAGES = {"labels": "Labels", "accuracy": "Accuracy", "speed": "Speed-up", "scenes": "Scenes"}
-"""File in `views/` and title; the first is the start page."""
 
 
 def main() -> None:
