@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,19 +35,6 @@ _TASK: dict[str, Any] = {
     "persist_result": False,
     "cache_policy": NO_CACHE,
 }
-
-SPEED = """
-    select guide, search, beta, count(*) as tasks,
-        round(avg(solved_unguided::int), 4) as solved_unguided,
-        round(avg(solved_guided::int), 4) as solved_guided,
-        round(avg(seconds_unguided), 5) as seconds_unguided,
-        round(avg(seconds_guided), 5) as seconds_guided,
-        round(sum(seconds_unguided) / nullif(sum(seconds_guided), 0), 3) as speed_up,
-        round(avg(nlps_unguided), 2) as nlps_unguided,
-        round(avg(nlps_guided), 2) as nlps_guided
-    from evaluations where checkpoint_id = '{checkpoint_id}'
-    group by all order by all
-"""
 
 
 @task(name="evaluate-shard", **_TASK)
@@ -89,8 +77,8 @@ def evaluate(
         max_workers: Processes that work at a time; the number of cores when empty. Times are of
             one core each; for the steadiest ones take 1.
     """
-    from relevance.evaluation import EvaluationConfig
-    from relevance.store import Dataset, sql
+    from relevance.evaluation import EvaluationConfig, load_scorer, speed_table
+    from relevance.store import Dataset
 
     root = absolute(dataset)
     there = Dataset.open(root)
@@ -99,6 +87,7 @@ def evaluate(
     shards = there.shards(config.split)
     if not shards:
         raise ParameterError(f"{root}: no {config.split} scenes, expected `generate` first")
+    checkpoint_id = load_scorer(path, into=there).checkpoint_id  # whatever its file is called
     run_shards(
         evaluate_one,
         {
@@ -113,13 +102,14 @@ def evaluate(
         stage="evaluate",
         max_workers=max_workers,
     )
-    report = Path(report_one(str(root), path.stem))
-    columns, rows = sql(root, SPEED.format(checkpoint_id=path.stem))
-    speed = [dict(zip(columns, row, strict=True)) for row in rows]
-    create_table_artifact(speed, key="evaluation", description=f"Guided planning, `{path.stem}`")
+    report = Path(report_one(str(root), checkpoint_id))
+    speed = [{k: _short(v) for k, v in row.items()} for row in speed_table(there, checkpoint_id)]
+    create_table_artifact(
+        speed, key="evaluation", description=f"Guided planning, `{checkpoint_id}`"
+    )
     create_link_artifact(report.as_uri(), key="report", link_text="Report", description="Report")
     create_markdown_artifact(
-        f"# Evaluation of {path.stem}\n\n{markdown(columns, rows)}\n\n"
+        f"# Evaluation of {checkpoint_id}\n\n{markdown(speed)}\n\n"
         f"Report: [{report}]({report.as_uri()})\n",
         key="evaluation-summary",
         description="What guidance saves, and the link to the report",
@@ -139,7 +129,15 @@ def newest_checkpoint(root: Path) -> Path:
     return root / last["path"]
 
 
-def markdown(columns: list[str], rows: list[tuple[Any, ...]]) -> str:
+def _short(value: Any) -> Any:
+    """Four digits, and nothing for what is not a number: JSON has no nan."""
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.4g}") if math.isfinite(value) else None
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
     """A Markdown table."""
-    lines = [columns, ["---"] * len(columns), *rows]
+    columns = list(rows[0]) if rows else []
+    lines = [columns, ["---"] * len(columns), *(list(row.values()) for row in rows)]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)

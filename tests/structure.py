@@ -27,6 +27,7 @@ ORDER = (
     "planner",
     "labels",
     "models",
+    "metrics",
     "training",
     "pipeline",
     "evaluation",

@@ -13,36 +13,31 @@ import numpy as np
 import pytest
 import torch
 from evaluated import EVALUATION, evaluated
-from hypothesis import given
-from hypothesis import strategies as st
 
+from relevance.configs import ConfigError
+from relevance.errors import RelevanceWarning
 from relevance.evaluation import (
     EvaluationConfig,
     EvaluationError,
     NetworkScorer,
+    checkpoint_id,
     choose_tasks,
     compare,
     evaluate,
+    left_out,
     load_guide,
     load_scorer,
     predict,
-)
-from relevance.evaluation.comparisons import (
-    Predictions,
-    guided_cost,
-    mean_interval,
-    ratio_interval,
     read_evaluations,
     read_predictions,
-    settings,
-    summarise,
+    unjudged,
 )
 from relevance.models import ModelConfig, RelevanceModel
 from relevance.planner import plan
-from relevance.scene import Box, Goal, Scene
+from relevance.scene import Box, Camera, Goal, Scene
 from relevance.simulation import Renderer
 from relevance.store import Dataset
-from relevance.training import CheckpointError
+from relevance.training import CheckpointError, load_checkpoint
 
 BLOCKED = Scene(
     objects=(
@@ -139,7 +134,7 @@ class Slow(NetworkScorer):
     """A network that takes a tenth of a CPU second to encode a scene."""
 
     def score_goals(self, scene, goals):
-        if scene.id not in self._encodings:
+        if not self._encodings:
             end = time.process_time() + 0.1
             while time.process_time() < end:
                 pass
@@ -165,16 +160,17 @@ def test_every_guided_run_pays_for_its_own_encoding() -> None:
     [
         ("guides", ("none",), "none"),
         ("guides", ("best",), "best"),
-        ("guides", (), "at least one"),
+        ("guides", (), "at least 1"),
         ("split", "tests", "tests"),
         ("tasks", -1, "tasks"),
         ("repeats", 0, "repeats"),
-        ("betas", (float("nan"),), "finite"),
+        ("beta", float("nan"), "finite"),
+        ("betas", (float("inf"),), "finite"),
         ("searches", ("random",), "random"),
     ],
 )
 def test_impossible_settings_are_refused_by_name(field, value, named) -> None:
-    with pytest.raises(ValueError, match=named):
+    with pytest.raises(ConfigError, match=named):
         EvaluationConfig(**{field: value})
 
 
@@ -230,10 +226,12 @@ def test_the_cache_is_bounded() -> None:
     scorer = NetworkScorer(small_model(), capacity=2)
     image, views = np.zeros((192, 320, 3), np.uint8), np.zeros((4, 32, 32, 3), np.uint8)
     for number in range(4):
-        scene = replace(BLOCKED, id=f"s{number}")
+        far = replace(BLOCKED.objects[-1], yaw=0.1 * number)
+        scene = replace(BLOCKED, objects=(*BLOCKED.objects[:-1], far))
         scorer.observe(scene, image, views)
         scorer.scores(scene, GOAL)
-    assert list(scorer._seen) == list(scorer._encodings) == ["s2", "s3"]
+    assert list(scorer._seen) == list(scorer._encodings)
+    assert len(scorer._seen) == 2
 
 
 def test_views_of_another_number_of_objects_are_refused() -> None:
@@ -253,6 +251,156 @@ def test_a_loaded_guide_guides() -> None:
     result = plan(BLOCKED, GOAL, guide=guide)
     assert result.moved == plan(BLOCKED, GOAL).moved
     assert result.seconds.guide > 0
+
+
+# --- never silently wrong -----------------------------------------------------------------------
+
+
+def moved(scene: Scene) -> Scene:
+    """The scene under its own id, its last box elsewhere."""
+    box = scene.objects[-1]
+    there = replace(box, position=(box.position[0], -box.position[1], box.position[2]))
+    return replace(scene, id=scene.id, objects=(*scene.objects[:-1], there))
+
+
+def test_a_box_moved_under_the_same_id_gets_its_own_scores() -> None:
+    scorer, elsewhere = NetworkScorer(small_model()), moved(BLOCKED)
+    assert elsewhere.id == BLOCKED.id
+    scorer.scores(BLOCKED, GOAL)
+    assert scorer.scores(elsewhere, GOAL) == NetworkScorer(small_model()).scores(elsewhere, GOAL)
+    assert scorer.scores(elsewhere, GOAL) != scorer.scores(BLOCKED, GOAL)
+
+
+def test_the_same_picture_under_another_id_is_not_drawn_again(monkeypatch) -> None:
+    scorer = NetworkScorer(small_model())
+    scorer.scores(BLOCKED, GOAL)
+    monkeypatch.setattr("relevance.simulation.Renderer", None)
+    assert scorer.scores(replace(BLOCKED, id="x"), GOAL) == scorer.scores(BLOCKED, GOAL)
+
+
+def test_a_camera_of_another_size_is_refused_before_a_picture_is_drawn(monkeypatch) -> None:
+    monkeypatch.setattr("relevance.simulation.Renderer", None)
+    large = replace(BLOCKED, camera=Camera(width=640, height=384))
+    with pytest.raises(EvaluationError, match="640x384 pixels, the model was trained on 320x192"):
+        NetworkScorer(small_model()).scores(large, GOAL)
+
+
+@pytest.mark.parametrize(
+    "camera", [Camera(target=(-2.0, 0.0, 1.0)), Camera(eye=(-0.5, 0.1, 0.7)), Camera(fov=60)]
+)
+def test_a_camera_that_looks_from_elsewhere_is_warned_of(camera) -> None:
+    with pytest.warns(RelevanceWarning, match=r"its camera \(eye .* trained with \(eye -0.66, 0"):
+        NetworkScorer(small_model()).scores(replace(BLOCKED, camera=camera), GOAL)
+
+
+def test_a_camera_that_randomised_scenes_have_and_distinct_boxes_are_not_warned_of(recwarn) -> None:
+    near = Camera(eye=(-0.655, 0.005, 0.66), fov=47.4)
+    NetworkScorer(small_model()).scores(replace(BLOCKED, camera=near), GOAL)
+    assert not [w for w in recwarn if issubclass(w.category, RelevanceWarning)]
+
+
+def test_boxes_that_look_the_same_are_named() -> None:
+    far = replace(BLOCKED["far"], size=BLOCKED["red"].size, color=BLOCKED["red"].color)
+    alike = replace(BLOCKED, objects=(*BLOCKED.objects[:-1], far))
+    with pytest.warns(RelevanceWarning, match="red, far look the same"):
+        NetworkScorer(small_model()).scores(alike, GOAL)
+
+
+def test_broken_weights_and_a_beta_that_is_no_number_are_refused() -> None:
+    model = small_model()
+    with torch.no_grad():
+        for weight in model.parameters():
+            weight.fill_(float("nan"))
+    with pytest.raises(EvaluationError, match="not finite"):
+        NetworkScorer(model, checkpoint_id="glimpse-1").scores(BLOCKED, GOAL)
+    for beta in (float("nan"), float("inf")):
+        with pytest.raises(EvaluationError, match="beta"):
+            load_guide("nothing.pt", beta=beta)
+
+
+def relabelled(tmp_path: Path, policy: str) -> tuple[Path, Path]:
+    """A copy whose labels of that policy call everything relevant; its checkpoint learned it."""
+    root, checkpoint = copied(tmp_path)
+    dataset = Dataset.open(root)
+    of = replace(dataset.labelling, policy=policy)
+    for file in dataset.files("labels", split="test"):
+        keys = dataset.file_keys(file)
+        where = {k: keys[k] for k in ("predicate", "split", "shard")}
+        rows = dataset.read_file(file).to_pylist()
+        rows = [row | {"policy": policy, "relevant": True} for row in rows]
+        dataset.write_rows("labels", rows, of=of, made_by=of.made_by, **where)
+    learned = checkpoint.with_name("learned.pt")
+    rewritten(checkpoint, learned, policy=policy)
+    shutil.rmtree(root / "predictions")
+    return root, learned
+
+
+def rewritten(checkpoint: Path, to: Path, **config) -> None:
+    """A checkpoint with another id and other training settings."""
+    model, meta = load_checkpoint(checkpoint)
+    meta = meta | {"checkpoint_id": "glimpse-foreign", "config": meta["config"] | config}
+    content = {"version": 1, "kind": "checkpoint", "meta": meta, "model": model.state_dict()}
+    torch.save(content, to)
+
+
+def test_predictions_are_judged_by_the_policy_that_the_checkpoint_learned(tmp_path) -> None:
+    root, learned = relabelled(tmp_path, "any-minimal")
+    predict(root, learned)
+    dataset = Dataset.open(root)
+    rows = dataset.read_rows("predictions")
+    assert rows
+    assert all(row["relevant"] for row in rows)
+    assert read_predictions(dataset, "glimpse-foreign").accuracy().share_relevant == 1.0
+
+
+def test_a_policy_that_the_dataset_does_not_have_is_refused_and_nothing_is_left(tmp_path) -> None:
+    root, checkpoint = copied(tmp_path)
+    learned = tmp_path / "learned.pt"
+    rewritten(checkpoint, learned, policy="necessary")
+    before = sorted(root.rglob("*"))
+    with pytest.raises(EvaluationError, match="no labels of split test by policy necessary"):
+        predict(root, learned)
+    assert sorted(root.rglob("*")) == before
+
+
+def test_a_renamed_or_foreign_checkpoint_is_known_by_the_id_inside(tmp_path) -> None:
+    root, checkpoint = copied(tmp_path)
+    renamed = checkpoint.rename(checkpoint.with_name("renamed.pt"))
+    assert checkpoint_id(renamed) == load_scorer(renamed).checkpoint_id == checkpoint.stem
+    foreign = tmp_path / "foreign.pt"
+    rewritten(renamed, foreign)
+    assert evaluate(root, foreign, replace(EVALUATION, tasks=1, sweep_tasks=0)) == 10
+    names = [row["checkpoint_id"] for row in Dataset.open(root).read_rows("checkpoints")]
+    assert sorted(names) == sorted([checkpoint.stem, "glimpse-foreign"])
+
+
+def test_rows_of_another_planner_are_left_out_and_said(tmp_path) -> None:
+    root, checkpoint = copied(tmp_path)
+    dataset = Dataset.open(root)
+    every = read_evaluations(dataset, checkpoint.stem)
+    assert left_out(dataset, checkpoint.stem) == []
+    where = {"name": checkpoint.stem, "split": "test", "shard": dataset.shards("test")[0]}
+    stored = dataset.read_file(dataset.shard_path("evaluations", **where)).to_pylist()
+    old = [row | {"planner_version": "0", "seconds_unguided": 1e6} for row in stored]
+    dataset.write_rows("evaluations", old, **where)
+    kept = read_evaluations(dataset, checkpoint.stem)
+    assert len(kept) == len(every) - len(stored)
+    assert "0" not in {row["planner_version"] for row in kept}
+    (said,) = left_out(dataset, checkpoint.stem)
+    assert said.startswith(f"{len(stored)} rows of planner 0 are left out")
+
+
+def test_labels_that_changed_after_the_prediction_count_and_are_said(tmp_path) -> None:
+    root, checkpoint = copied(tmp_path)
+    dataset = Dataset.open(root)
+    assert unjudged(dataset, checkpoint.stem) == []
+    for file in dataset.files("labels", split="test"):
+        keys = dataset.file_keys(file)
+        where = {k: keys[k] for k in ("predicate", "split", "shard")}
+        rows = [row | {"relevant": True} for row in dataset.read_file(file).to_pylist()]
+        dataset.write_rows("labels", rows, made_by=dataset.metadata(file) | {}, **where)
+    assert read_predictions(dataset, checkpoint.stem).accuracy().share_relevant == 1.0
+    assert any("labels changed since" in note for note in unjudged(dataset, checkpoint.stem))
 
 
 # --- rows -------------------------------------------------------------------------------------
@@ -359,135 +507,3 @@ def copied(tmp_path: Path) -> tuple[Path, Path]:
     copy = tmp_path / "copy"
     shutil.copytree(root, copy)
     return copy, copy / checkpoint.relative_to(root)
-
-
-# --- figures by hand --------------------------------------------------------------------------
-
-BY_HAND = Predictions(
-    predicate=np.array(["on", "on", "on", "behind", "behind", "behind"]),
-    task=np.array([1, 1, 1, 2, 2, 2]),
-    relevant=np.array([True, False, True, False, True, False]),
-    score=np.array([2.0, -1.0, -3.0, 0.0, 1.0, 4.0]),
-    is_goal_object=np.array([False, False, False, False, True, False]),
-)
-
-
-def test_accuracy_by_hand() -> None:
-    found = BY_HAND.accuracy()
-    assert (found.n_tasks, found.n_rows) == (2, 6)
-    assert found.true_relevant == pytest.approx(2 / 3)
-    assert found.true_irrelevant == pytest.approx(2 / 3)  # a score of 0 is left out at beta 0
-    assert found.total == pytest.approx(4 / 6)
-    assert found.base_rate == pytest.approx(3 / 6)
-    assert found.tasks_whole == pytest.approx(1 / 2)
-    looser = BY_HAND.accuracy(beta=3.5)
-    assert looser.true_relevant == 1.0
-    assert looser.true_irrelevant == 0.0
-    assert BY_HAND.of("on").accuracy().total == pytest.approx(2 / 3)
-    assert BY_HAND.of("same-plane").queries().accuracy().n_rows == 2
-    assert np.isnan(BY_HAND.of("same-plane").queries().accuracy().true_relevant)
-
-
-@given(
-    st.lists(st.tuples(st.booleans(), st.floats(-9, 9)), min_size=1, max_size=30),
-    st.floats(-9, 9),
-    st.floats(0, 9),
-)
-def test_a_larger_beta_keeps_more(rows, beta, more) -> None:
-    relevant, score = (np.array(column) for column in zip(*rows, strict=True))
-    n = len(rows)
-    predictions = Predictions(
-        predicate=np.full(n, "on"),
-        task=np.arange(n) // 3,
-        relevant=relevant,
-        score=score,
-        is_goal_object=np.zeros(n, bool),
-    )
-    tight, loose = predictions.accuracy(beta), predictions.accuracy(beta + more)
-    if relevant.any():
-        assert loose.true_relevant >= tight.true_relevant
-    if not relevant.all():
-        assert loose.true_irrelevant <= tight.true_irrelevant
-    assert loose.tasks_whole >= tight.tasks_whole
-
-
-def row(unguided: float, guided: float, solved: tuple[bool, bool], predicate: str = "on") -> dict:
-    return {
-        "guide": "prune",
-        "search": "tree",
-        "beta": 0.0,
-        "predicate": predicate,
-        "n_objects": 4,
-        "n_kept": 2,
-        "solved_unguided": solved[0],
-        "solved_guided": solved[1],
-        "seconds_unguided": unguided,
-        "seconds_guided": guided,
-        "seconds_inference": 0.5,
-        "nodes_unguided": 10,
-        "nodes_guided": 4,
-        "nlps_unguided": 6,
-        "nlps_guided": 2,
-        "n_actions_unguided": 4 if solved[0] else None,
-        "n_actions_guided": 4 if solved[1] else None,
-    }
-
-
-def test_a_comparison_by_hand() -> None:
-    rows = [
-        row(8.0, 2.0, (True, True)),
-        row(4.0, 2.0, (True, True), "behind"),
-        row(6.0, 1.0, (True, False)),  # a miss: 1 s in vain, then 6 s
-        row(5.0, 1.0, (False, False)),
-        row(9.0, 1.0, (False, True)),
-    ]
-    found = summarise(rows)
-    assert (found.n_tasks, found.n_solvable, found.n_both) == (5, 3, 2)
-    assert (found.misses, found.gains) == (1, 1)
-    assert [guided_cost(r) for r in rows] == [2.0, 2.0, 7.0, 1.0, 1.0]
-    assert found.unguided.value == pytest.approx(6.0)
-    assert found.guided.value == pytest.approx(11 / 3)
-    assert found.speedup.value == pytest.approx(18 / 11)
-    assert found.speedup_both.value == pytest.approx(12 / 4)
-    assert found.reduction == pytest.approx(2 / 3)
-    assert found.speedup_all.value == pytest.approx(32 / 13)
-    assert found.kept == pytest.approx(0.5)
-    assert summarise(rows, "on").n_solvable == 2
-    assert summarise(rows, "same-plane").n_tasks == 1
-    assert list(settings(rows)) == [("tree", "prune", 0.0)]
-
-
-def test_no_tasks_give_no_figure() -> None:
-    found = summarise([row(1.0, 1.0, (False, False))], "behind")
-    assert found.n_tasks == 0
-    assert np.isnan(found.speedup.value)
-
-
-def test_intervals_cover_two_thirds() -> None:
-    rng = np.random.default_rng(0)
-    hits = 0
-    for _ in range(120):
-        found = mean_interval(rng.normal(3.0, 1.0, size=40))
-        hits += found.low <= 3.0 <= found.high
-    assert 0.55 <= hits / 120 <= 0.79
-    values = rng.exponential(size=25)
-    assert mean_interval(values) == mean_interval(values)
-    assert mean_interval([2.0]).low == mean_interval([2.0, 2.0]).high == 2.0
-    assert mean_interval([]).n == 0
-
-
-def test_a_ratio_is_of_sums_and_paired() -> None:
-    slow = np.array([1.0, 10.0, 100.0])
-    found = ratio_interval(slow, slow / 2)
-    assert (found.low, found.value, found.high) == pytest.approx((2.0, 2.0, 2.0))
-    assert ratio_interval([1.0, 9.0], [1.0, 1.0]).value == pytest.approx(5.0)
-
-
-def test_predictions_are_read_with_their_tasks() -> None:
-    root, checkpoint = evaluated()
-    dataset = Dataset.open(root)
-    found = read_predictions(dataset, checkpoint.stem)
-    plans = {r["plan_id"] for r in dataset.read_rows("labels", split="test")}
-    assert len(np.unique(found.task)) == len(plans)
-    assert len(found.queries()) == len(found) - 2 * len(plans)
-    assert len(read_predictions(dataset, "none")) == 0

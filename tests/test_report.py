@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 from evaluated import DATA, evaluated, labelled
 
-from relevance.evaluation import comparisons as figures
+from relevance import evaluation as figures
 from relevance.pipeline import describe
-from relevance.report import gallery, plots
-from relevance.report.gallery import KEPT, LOST, RELEVANT, outlined
+from relevance.planner import GUIDES
+from relevance.report import gallery
+from relevance.report.gallery import outlined
 from relevance.report.page import build
+from relevance.report.paper import paper
+from relevance.report.style import KEPT, LOST, RELEVANT, TIMES, guide_style, seconds
 from relevance.store import Dataset, DatasetError
 from relevance.training import load_checkpoint
 
@@ -111,16 +114,16 @@ def test_the_whole_page_says_what_the_rows_say() -> None:
     dataset = Dataset.open(root)
     predictions = figures.read_predictions(dataset, checkpoint.stem).queries()
     metrics = load_checkpoint(checkpoint)[1]["metrics"]
-    for group, paper in (("same-plane", "94%"), ("on", "87%")):
+    for group, theirs in (("same-plane", "94%"), ("on", "87%")):
         plain = predictions.of(group).accuracy()
         beta = metrics[group]["queries"]["best_beta"]
         found = predictions.of(group).accuracy(beta)
         card = f"{100 * found.total:.1f}% accuracy, {group} base rate {100 * found.base_rate:.1f}%"
         tuned = f"beta {beta:.1f} from validation, {100 * plain.total:.1f}% at beta 0"
-        assert f"{card}; {found.n_tasks} tasks; {tuned}; paper: {paper}" in page.text
+        assert f"{card}; {found.n_tasks} tasks; {tuned}; paper: {theirs}" in page.text
     rows = figures.settings(figures.read_evaluations(dataset, checkpoint.stem))
     whole_guide = figures.summarise(rows["tree", "prune-then-full", 0.0])
-    assert f"{whole_guide.speedup.value:.2f}{plots.TIMES} speed-up by prune-then-full" in page.text
+    assert f"{whole_guide.speedup.value:.2f}{TIMES} speed-up by prune-then-full" in page.text
     assert f"over {whole_guide.n_solvable} tasks" in page.text
     for svg in ("labels", "lengths", "times", "accuracy", "beta", "scores", "training"):
         assert f"{svg}-figure_1" in page.ids
@@ -157,8 +160,8 @@ def test_misses_link_to_their_scenes_and_no_weights_are_needed(tmp_path) -> None
     linked = [name for name in page.links if name.startswith("task-")]
     assert linked
     assert set(linked) <= set(missed)
-    assert text.count("Missed by prune") == len(set(linked) & set(page.ids))
-    assert f"{len(missed)} missed, left out" in page.text
+    assert text.count("Missed by prune.") == len(set(linked) & set(page.ids))
+    assert f"{len(missed)} missed, counted" in page.text
 
 
 def test_equal_rows_give_an_equal_page(tmp_path) -> None:
@@ -218,4 +221,80 @@ def test_an_outline_follows_its_mask() -> None:
     [(0.0, "0"), (0.0031, "3.1 ms"), (0.0567, "57 ms"), (1.24, "1.2 s"), (43.0, "43 s")],
 )
 def test_seconds_read_well(value, text) -> None:
-    assert plots.seconds(value) == text
+    assert seconds(value) == text
+
+
+def changed(tmp_path: Path, table: str, **values) -> Dataset:
+    """A copy of the evaluated dataset, columns of a table's test rows set to other values."""
+    root, checkpoint = evaluated()
+    copy = tmp_path / "copy"
+    shutil.copytree(root, copy)
+    dataset = Dataset.open(copy)
+    for shard in dataset.shards("test"):
+        where = {"name": checkpoint.stem, "split": "test", "shard": shard}
+        rows = dataset.read_file(dataset.shard_path(table, **where)).to_pylist()
+        dataset.write_rows(table, [row | values for row in rows], **where)
+    return dataset
+
+
+def test_a_guide_that_nobody_knows_does_not_stop_the_report(tmp_path) -> None:
+    dataset = changed(tmp_path, "evaluations", guide="oracle", beta=0.0)
+    page = whole(build(dataset.path).read_text())
+    assert "speed-up by oracle, tree search" in page.text
+
+
+def test_guides_have_a_colour_each() -> None:
+    names = ["unguided", *(name for name in GUIDES if name != "none")]
+    assert len({guide_style(name).color for name in names}) == len(names)
+    assert [name for name in names if not guide_style(name).complete] == ["prune"]
+    assert guide_style("oracle") == guide_style("oracle")
+
+
+def test_the_page_says_whose_labels_judge() -> None:
+    page = whole(page_of_everything())
+    assert "labels by policy found" in page.text
+    assert "Judged by the labels of policy found , which this checkpoint learned." in page.text
+
+
+def test_rows_of_another_planner_are_said(tmp_path) -> None:
+    dataset = changed(tmp_path, "evaluations", planner_version="0")
+    page = whole(build(dataset.path).read_text())
+    planner = dataset.labelling.planner
+    assert f"these reruns are of planner 0, the labels of planner {planner}" in page.text
+
+
+def test_the_papers_figures_agree_with_themselves() -> None:
+    found = paper()
+    assert tuple(found.accuracy["on"]) == (0.81, 0.89, 0.87) == tuple(found.bodies["Transformer"])
+    assert found.seconds == (3.06, 4.47)
+    assert {name: round(q.share, 3) for name, q in found.test.items()} == {
+        "on-the-left": 0.138,
+        "on-the-right": 0.140,
+        "in-front": 0.138,
+        "behind": 0.139,
+        "on": 0.289,
+        "same-plane": 0.139,
+    }
+    for group, accuracy in found.accuracy.items():
+        share = found.test[group].share
+        total = share * accuracy.true_relevant + (1 - share) * accuracy.true_irrelevant
+        assert total == pytest.approx(accuracy.total, abs=0.015), group
+    for group, time in found.runtime.items():
+        assert 1 - time.guided / time.unguided == pytest.approx(time.saved, abs=0.005), group
+    same = [found.runtime[name].unguided for name in found.scenes if name != "on"]
+    assert found.runtime["same-plane"].unguided == pytest.approx(sum(same) / 4, abs=0.005)
+    assert {len(values) for values in found.curves.values()} == {11}
+    for kept, lost in zip(
+        found.curves["true_relevant"], found.curves["false_irrelevant"], strict=True
+    ):
+        assert kept + lost == pytest.approx(1, abs=0.011)
+
+
+def test_no_other_file_has_figures_or_colours_of_its_own() -> None:
+    root = Path(__file__).parent.parent
+    files = [*(root / "relevance" / "report").glob("*.py"), *(root / "dashboards").rglob("*.py")]
+    for file in files:
+        text = file.read_text()
+        if file.name != "style.py":
+            assert not re.search(r"\"#[0-9a-f]{6}\"", text), file
+        assert not re.search(r"0\.94|4\.47|4\.7\b|3\.06", text), file

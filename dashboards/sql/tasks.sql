@@ -1,5 +1,5 @@
--- Planned goals of one split for the grid of scenes: the moved objects, and the scores of one
--- checkpoint as a map from name to score.
+-- Planned goals of one split for the grid of scenes: the relevant objects, and the scores of
+-- one checkpoint as a map from name to score.
 WITH scored AS (
     SELECT
         scene_id, predicate, subject, reference,
@@ -7,12 +7,19 @@ WITH scored AS (
     FROM predictions
     WHERE checkpoint_id = $checkpoint_id AND split = $split
     GROUP BY ALL
+),
+labelled AS (
+    SELECT plan_id, list(query ORDER BY query) FILTER (relevant) AS relevant
+    FROM labels
+    WHERE split = $split
+    GROUP BY plan_id
 )
 SELECT
     p.plan_id, p.scene_id, p.shard, p.predicate, p.subject, p.reference,
-    p.status, p.reason, p.actions, p.moved, s.scores,
+    p.status, p.reason, p.actions, coalesce(l.relevant, []) AS relevant, s.scores,
     len(list_filter(p.moved, lambda name: name NOT IN (p.subject, p.reference))) AS blockers
 FROM plans AS p LEFT JOIN scored AS s USING (scene_id, predicate, subject, reference)
+LEFT JOIN labelled AS l USING (plan_id)
 WHERE p.split = $split AND p.predicate IN (SELECT unnest($predicates::VARCHAR[]))
     AND p.status IN (SELECT unnest($statuses::VARCHAR[]))
 ORDER BY md5(p.plan_id);

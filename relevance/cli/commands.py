@@ -164,7 +164,8 @@ def _evaluate(preset: Preset) -> Callable[..., int]:
             scored = evaluation.predict(dataset, path, split=config.split, progress=progress)
         with bar("tasks") as progress:
             rows = evaluation.evaluate(dataset, path, config, progress=progress)
-        say(f"{dataset}: {scored} predictions, {rows} comparisons of {path.stem}")
+        name = evaluation.checkpoint_id(path)
+        say(f"{dataset}: {scored} predictions, {rows} comparisons of {name}")
         return 0
 
     return evaluate

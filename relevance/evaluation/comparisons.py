@@ -1,164 +1,22 @@
-"""Rows of `predictions` and `evaluations` to the figures that pages and tables show.
+"""Rows of `evaluations` to the figures that pages and tables show: the one speed-up.
 
-Accuracies are shares of objects; times are CPU seconds a task with bootstrap intervals. A
-task that a guide misses stays in the figures: its cost is the guided attempt and then the
-unguided run that a user would need. The paper's way, misses left out, stands beside it.
+Times are CPU seconds a task with bootstrap intervals. A task that a guide misses stays in the
+figures: its cost is the guided attempt and then the unguided run that a user would need. The
+paper's way, misses left out, stands beside it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from relevance.scene import PREDICATES
+from relevance.evaluation.predictions import in_group
+from relevance.metrics import Interval, mean, mean_interval, ratio_interval
+from relevance.planner import PLANNER_VERSION
+from relevance.scene import FAMILIES
 from relevance.store import Dataset
-
-CONFIDENCE = 0.67
-"""Level of every interval, as in the paper's runtime tables."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Accuracy:
-    """Shares of objects judged rightly at one beta, in 0..1; nan where there are none."""
-
-    n_tasks: int
-    n_rows: int
-    share_relevant: float
-    true_relevant: float
-    """Of the relevant objects, the share kept."""
-    true_irrelevant: float
-    """Of the irrelevant objects, the share left out."""
-    total: float
-    base_rate: float
-    """What `always irrelevant` scores in total."""
-    tasks_whole: float
-    """Share of tasks in which every relevant object was kept, so that `prune` can succeed."""
-
-    @property
-    def balanced(self) -> float:
-        """Mean of the two shares; a constant answer reaches 0.5."""
-        return (self.true_relevant + self.true_irrelevant) / 2
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Predictions:
-    """Predictions of one checkpoint as columns, (R,) each."""
-
-    predicate: np.ndarray
-    task: np.ndarray
-    """Number of the task that the row belongs to."""
-    relevant: np.ndarray
-    score: np.ndarray
-    is_goal_object: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.score)
-
-    def where(self, mask: np.ndarray) -> Predictions:
-        """The rows that a boolean mask (R,) selects."""
-        return Predictions(
-            predicate=self.predicate[mask],
-            task=self.task[mask],
-            relevant=self.relevant[mask],
-            score=self.score[mask],
-            is_goal_object=self.is_goal_object[mask],
-        )
-
-    def of(self, group: str) -> Predictions:
-        """Rows of one predicate, or of the family `same-plane`; `all` gives everything."""
-        if group == "all":
-            return self
-        return self.where(np.array([in_group(name, group) for name in self.predicate], bool))
-
-    def queries(self) -> Predictions:
-        """Rows other than those of subject and reference."""
-        return self.where(~self.is_goal_object)
-
-    def accuracy(self, beta: float = 0.0) -> Accuracy:
-        """Shares judged rightly when an object is kept iff score > -beta."""
-        kept, relevant = self.score > -beta, self.relevant
-        tasks, numbers = np.unique(self.task, return_inverse=True)
-        lost = np.zeros(len(tasks), dtype=bool)
-        np.logical_or.at(lost, numbers, relevant & ~kept)
-        return Accuracy(
-            n_tasks=len(tasks),
-            n_rows=len(self),
-            share_relevant=_mean(relevant),
-            true_relevant=_mean(kept[relevant]),
-            true_irrelevant=_mean(~kept[~relevant]),
-            total=_mean(kept == relevant),
-            base_rate=_mean(~relevant),
-            tasks_whole=_mean(~lost),
-        )
-
-
-def read_predictions(dataset: Dataset, checkpoint_id: str, *, split: str = "test") -> Predictions:
-    """All predictions of a checkpoint on a split, in a fixed order."""
-    with dataset.connect() as connection:
-        columns = connection.execute(
-            """
-            select predicate, relevant, score, is_goal_object,
-                dense_rank() over (order by scene_id, predicate, subject, reference) as task
-            from predictions where checkpoint_id = ? and split = ?
-            order by task, query
-            """,
-            [checkpoint_id, split],
-        ).fetchnumpy()
-    return Predictions(
-        predicate=np.asarray(columns["predicate"], dtype=str),
-        task=np.asarray(columns["task"], dtype=int),
-        relevant=np.asarray(columns["relevant"], dtype=bool),
-        score=np.asarray(columns["score"], dtype=float),
-        is_goal_object=np.asarray(columns["is_goal_object"], dtype=bool),
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Interval:
-    """An estimate with its 67% confidence interval, over `n` tasks; nan when there are none."""
-
-    value: float
-    low: float
-    high: float
-    n: int
-
-
-def mean_interval(values: Iterable[float]) -> Interval:
-    """Mean with a bootstrap interval (bias-corrected); same values, same interval."""
-    return _bootstrap((np.asarray(list(values), dtype=float),), lambda a, axis: a.mean(axis=axis))
-
-
-def ratio_interval(above: Iterable[float], below: Iterable[float]) -> Interval:
-    """Ratio of two paired sums with a bootstrap interval over the pairs."""
-    return _bootstrap(
-        (np.asarray(list(above), dtype=float), np.asarray(list(below), dtype=float)),
-        lambda a, b, axis: a.sum(axis=axis) / b.sum(axis=axis),
-    )
-
-
-def _bootstrap(samples: tuple[np.ndarray, ...], statistic: Callable[..., Any]) -> Interval:
-    from scipy.stats import bootstrap  # half a second to import
-
-    n = len(samples[0])
-    if n == 0:
-        return Interval(value=np.nan, low=np.nan, high=np.nan, n=0)
-    value = float(statistic(*samples, axis=-1))
-    if n < 2 or all((s == s[0]).all() for s in samples):
-        return Interval(value=value, low=value, high=value, n=n)
-    interval = bootstrap(
-        samples,
-        statistic,
-        paired=len(samples) > 1,
-        vectorized=True,
-        n_resamples=2000,
-        confidence_level=CONFIDENCE,
-        method="percentile",  # the bias-corrected one is undefined for tiny or tied samples
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return Interval(value=value, low=float(interval.low), high=float(interval.high), n=n)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,7 +64,35 @@ class Comparison:
 
 
 def read_evaluations(dataset: Dataset, checkpoint_id: str) -> list[dict[str, Any]]:
-    """All evaluation rows of a checkpoint, in a fixed order."""
+    """Evaluation rows of a checkpoint, in a fixed order, of one planner and one set of settings.
+
+    What another planner version or other settings made is left out, see `left_out`.
+    """
+    rows = _all_rows(dataset, checkpoint_id)
+    kind = _kind(rows)
+    return [row for row in rows if _made_by(row) == kind]
+
+
+def left_out(dataset: Dataset, checkpoint_id: str) -> list[str]:
+    """What a reader of `read_evaluations` should know of its rows and the ones left out."""
+    rows = _all_rows(dataset, checkpoint_id)
+    kind = _kind(rows)
+    if kind is None:
+        return []
+    said = []
+    for made_by, count in sorted(Counter(map(_made_by, rows)).items(), key=str):
+        if made_by != kind:
+            what = "other settings" if made_by[0] == kind[0] else f"planner {made_by[0]}"
+            said.append(
+                f"{count} rows of {what} are left out; `relevance evaluate` makes them anew"
+            )
+    planner = dataset.labelling.planner if dataset.labelling else kind[0]
+    if kind[0] != planner:
+        said.append(f"these reruns are of planner {kind[0]}, the labels of planner {planner}")
+    return said
+
+
+def _all_rows(dataset: Dataset, checkpoint_id: str) -> list[dict[str, Any]]:
     with dataset.connect() as connection:
         found = connection.execute(
             """
@@ -217,6 +103,18 @@ def read_evaluations(dataset: Dataset, checkpoint_id: str) -> list[dict[str, Any
         )
         names = [column[0] for column in found.description]
         return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
+
+
+def _made_by(row: dict[str, Any]) -> tuple[str | None, str | None]:
+    return row["planner_version"], row["config_hash"]
+
+
+def _kind(rows: Sequence[dict[str, Any]]) -> tuple[str | None, str | None] | None:
+    """The planner version and settings that count: ours before others, then what made most."""
+    counts = Counter(map(_made_by, rows))
+    return max(
+        counts, key=lambda made: (made[0] == PLANNER_VERSION, counts[made], str(made)), default=None
+    )
 
 
 def summarise(rows: Sequence[dict[str, Any]], group: str = "all") -> Comparison:
@@ -253,13 +151,13 @@ def summarise(rows: Sequence[dict[str, Any]], group: str = "all") -> Comparison:
         speedup=speedup(solvable),
         speedup_both=speedup(both),
         speedup_all=speedup(chosen),
-        nodes_unguided=_mean(column("nodes_unguided", solvable)),
-        nodes_guided=_mean(column("nodes_guided", solvable)),
-        nlps_unguided=_mean(column("nlps_unguided", solvable)),
-        nlps_guided=_mean(column("nlps_guided", solvable)),
-        actions_unguided=_mean(column("n_actions_unguided", both)),
-        actions_guided=_mean(column("n_actions_guided", both)),
-        kept=_mean([row["n_kept"] / row["n_objects"] for row in chosen if row["n_kept"]]),
+        nodes_unguided=mean(column("nodes_unguided", solvable)),
+        nodes_guided=mean(column("nodes_guided", solvable)),
+        nlps_unguided=mean(column("nlps_unguided", solvable)),
+        nlps_guided=mean(column("nlps_guided", solvable)),
+        actions_unguided=mean(column("n_actions_unguided", both)),
+        actions_guided=mean(column("n_actions_guided", both)),
+        kept=mean([row["n_kept"] / row["n_objects"] for row in chosen if row["n_kept"]]),
     )
 
 
@@ -279,11 +177,30 @@ def settings(
     return dict(sorted(found.items()))
 
 
-def in_group(predicate: str, group: str) -> bool:
-    """Whether a predicate belongs to `all`, to a family or is the group itself."""
-    return group == "all" or group == predicate or PREDICATES[predicate].family == group
-
-
-def _mean(values: Any) -> float:
-    values = np.asarray(values)
-    return float(values.mean()) if len(values) else float("nan")
+def speed_table(dataset: Dataset, checkpoint_id: str) -> list[dict[str, Any]]:
+    """What a checkpoint saves, a row a search, guide, beta and family, then of all predicates."""
+    table = []
+    for (search, guide, beta), rows in settings(read_evaluations(dataset, checkpoint_id)).items():
+        for group in (*FAMILIES, "all"):
+            found = summarise(rows, group)
+            if not found.n_tasks:
+                continue
+            table.append(
+                {
+                    "search": search,
+                    "guide": guide,
+                    "beta": beta,
+                    "family": group,
+                    "tasks": found.n_tasks,
+                    "solvable": found.n_solvable,
+                    "missed": found.misses,
+                    "seconds_unguided": found.unguided.value,
+                    "seconds_guided": found.guided.value,
+                    "seconds_network": found.inference.value,
+                    "speedup": found.speedup.value,
+                    "speedup_both": found.speedup_both.value,
+                    "nlps_unguided": found.nlps_unguided,
+                    "nlps_guided": found.nlps_guided,
+                }
+            )
+    return table

@@ -18,6 +18,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from relevance.report.style import (
+    BOUND_COLOR,
+    CARD_REFERENCE,
+    CARD_RELEVANT,
+    CARD_SUBJECT,
+    GREY,
+    GROUPS,
+    SPLIT_COLOR,
+    family_color,
+)
 from relevance.report.tables import Statistics, Table, cell, statistics
 from relevance.scene import PREDICATES
 from relevance.store import Dataset
@@ -25,10 +35,6 @@ from relevance.store import Dataset
 PAGE = "README.md"
 MADE_WITH = ("relevance", "numpy", "pybullet", "casadi", "numba", "pyarrow", "duckdb")
 """Packages whose versions the card states."""
-SPLIT_COLORS = {"train": "#2f6db3", "validation": "#8a939d", "test": "#c26a1c"}
-FAMILY_COLORS = {"same-plane": "#2f6db3", "on": "#c26a1c"}
-SUBJECT, REFERENCE, RELEVANT = "#ffffff", "#101418", "#ff2d95"
-"""Outlines in the example scenes."""
 _WIDTH, _DPI = 7.2, 110
 
 
@@ -145,7 +151,7 @@ def _figure(columns: int, height: float = 2.6) -> tuple[Figure, list[Axes]]:
 
 def _balance(found: Statistics) -> dict[str, tuple[int, int]]:
     """Queries and relevant ones of each family."""
-    sums = {"same-plane": (0, 0), "on": (0, 0)}
+    sums: dict[str, tuple[int, int]] = {group: (0, 0) for group in GROUPS}
     for row in _dicts(found["label_balance"]):
         family = PREDICATES[row["predicate"]].family
         queries, relevant = sums[family]
@@ -159,12 +165,12 @@ def _label_balance(found: Statistics) -> Figure | None:
         return None
     figure, (ax,) = _figure(1)
     predicates = [name for name in PREDICATES if any(r["predicate"] == name for r in rows)]
-    splits = [s for s in SPLIT_COLORS if any(r["split"] == s for r in rows)]
+    splits = [s for s in SPLIT_COLOR if any(r["split"] == s for r in rows)]
     width = 0.8 / len(splits)
     for i, split in enumerate(splits):
         mine = {row["predicate"]: row["relevant_share"] for row in rows if row["split"] == split}
         at = np.array([predicates.index(p) for p in mine]) + (i - (len(splits) - 1) / 2) * width
-        ax.bar(at, [100 * s for s in mine.values()], width, label=split, color=SPLIT_COLORS[split])
+        ax.bar(at, [100 * s for s in mine.values()], width, label=split, color=SPLIT_COLOR[split])
     ax.set_xticks(range(len(predicates)), predicates)
     ax.set_ylabel("relevant queries, %")
     ax.legend(fontsize=8, frameon=False)
@@ -176,14 +182,14 @@ def _shares(
 ) -> None:
     """Bars: for each family, the share of each value of `key`."""
     values = sorted({row[key] for row in rows})
-    families = [f for f in FAMILY_COLORS if any(family(row) == f for row in rows)]
+    families = [f for f in GROUPS if any(family(row) == f for row in rows)]
     width = 0.8 / max(len(families), 1)
     for i, name in enumerate(families):
         mine = [row for row in rows if family(row) == name]
         total = sum(row[count] for row in mine)
         heights = [100 * sum(r[count] for r in mine if r[key] == v) / total for v in values]
         at = np.arange(len(values)) + (i - (len(families) - 1) / 2) * width
-        ax.bar(at, heights, width, label=name, color=FAMILY_COLORS[name])
+        ax.bar(at, heights, width, label=name, color=family_color(name))
     ax.set_xticks(range(len(values)), [str(value) for value in values])
     ax.set_ylabel("%")
 
@@ -213,7 +219,7 @@ def _sizes(found: Statistics) -> Figure | None:
         (axes[1], "plan_share", "goals with a plan, %", 100),
         (axes[2], "median_seconds", "median planning time, ms", 1000),
     ):
-        for family, color in FAMILY_COLORS.items():
+        for family in GROUPS:
             mine = [r for r in rows if r["family"] == family and r[key] is not None]
             if mine:
                 ax.plot(
@@ -221,7 +227,7 @@ def _sizes(found: Statistics) -> Figure | None:
                     [factor * row[key] for row in mine],
                     marker="o",
                     markersize=3,
-                    color=color,
+                    color=family_color(family),
                     label=family,
                 )
         ax.set_xlabel("boxes")
@@ -256,7 +262,7 @@ def _failures(found: Statistics) -> Figure | None:
     ordered = sorted(goals.items(), key=lambda item: (item[1], item[0]))[-8:]
     figure, (ax,) = _figure(1, 0.7 + 0.28 * len(ordered))
     bars = ax.barh(
-        [name for name, _ in ordered], [100 * n / found.goals for _, n in ordered], color="#8a939d"
+        [name for name, _ in ordered], [100 * n / found.goals for _, n in ordered], color=GREY
     )
     ax.bar_label(bars, [str(n) for _, n in ordered], fontsize=8, padding=3)
     ax.set_xlabel("goals, %")
@@ -275,13 +281,7 @@ def _seconds(found: Statistics) -> Figure | None:
     figure, (ax,) = _figure(1, 2.4)
     names = [row["predicate"] for row in rows]
     left = np.zeros(len(rows))
-    colors = {
-        "pose": "#2f6db3",
-        "keyframe": "#3a8a5f",
-        "path": "#c26a1c",
-        "rest": "#8a939d",
-    }
-    for part, color in colors.items():
+    for part, color in BOUND_COLOR.items():
         widths = np.array([1000 * (row[part] or 0.0) / row["goals"] for row in rows])
         ax.barh(names, widths, left=left, color=color, label=part)
         left += widths
@@ -301,8 +301,12 @@ _PICTURES: dict[str, tuple[str, Callable[[Statistics], Figure | None]]] = {
 
 
 _EXAMPLES = """
-    SELECT p.scene_id, p.split, p.shard, p.predicate, p.subject, p.reference, p.moved, p.n_actions
-    FROM plans AS p
+    SELECT
+        p.scene_id, p.split, p.shard, p.predicate, p.subject, p.reference, p.n_actions,
+        coalesce(l.relevant, []) AS relevant
+    FROM plans AS p LEFT JOIN (
+        SELECT plan_id, list(query) FILTER (relevant) AS relevant FROM labels GROUP BY plan_id
+    ) AS l USING (plan_id)
     WHERE p.holds
     QUALIFY row_number() OVER (
         PARTITION BY p.predicate
@@ -312,7 +316,7 @@ _EXAMPLES = """
 
 
 def _examples(dataset: Dataset) -> Figure | None:
-    """One scene for each predicate, with what its plan moves."""
+    """One scene for each predicate, with what is relevant in it."""
     with dataset.connect() as connection:
         found = connection.execute(_EXAMPLES)
         names = [column[0] for column in found.description or ()]
@@ -328,8 +332,8 @@ def _examples(dataset: Dataset) -> Figure | None:
             s for s in dataset.samples(row["split"], [row["shard"]]) if s.key == row["scene_id"]
         )
         ax.imshow(sample.image)
-        colors = dict.fromkeys(row["moved"], RELEVANT)
-        colors |= {row["subject"]: SUBJECT, row["reference"]: REFERENCE}
+        colors = dict.fromkeys(row["relevant"], CARD_RELEVANT)
+        colors |= {row["subject"]: CARD_SUBJECT, row["reference"]: CARD_REFERENCE}
         for name, color in colors.items():
             shown = sample.mask == sample.scene.names.index(name) + 1
             ax.contour(shown, levels=[0.5], colors=[color], linewidths=1.4)

@@ -12,13 +12,11 @@ import cv2
 import numpy as np
 
 from relevance.hashing import content_hash
+from relevance.report.style import INK, KEPT, LOST, RELEVANT
 from relevance.scene import PREDICATES
 from relevance.store import Dataset, Sample
 
 Rows = Callable[..., list[dict[str, Any]]]
-
-RELEVANT, KEPT, LOST = "#12a150", "#e08a00", "#d92d20"
-"""Outlines: relevant; kept by the network though irrelevant; left out though relevant."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +52,8 @@ def choose_examples(
 ) -> list[dict[str, Any]]:
     """Test tasks to show: of each predicate those with most blockers, and some that were missed.
 
-    `missed` holds the evaluation rows of tasks that `prune` failed and the unguided run solved.
+    `missed` holds the evaluation rows of tasks that a guide failed and the unguided run solved.
+    What is relevant is what the labels that `rows` sees say.
     """
     wanted = rows(
         """
@@ -85,7 +84,14 @@ def choose_examples(
                 *task,
             )
         }
-    note = "Missed by prune: a relevant object was left out."
+    labels = rows(
+        """
+        select plan_id, list(query order by query) filter (relevant) as relevant
+        from labels where plan_id in (select unnest(?::varchar[])) group by plan_id
+        """,
+        [row["plan_id"] for row in chosen.values()],
+    )
+    relevant = {row["plan_id"]: row["relevant"] or [] for row in labels}
     predictions = rows(
         """
         select scene_id, predicate, subject, reference, query, score from predictions
@@ -99,7 +105,12 @@ def choose_examples(
         scores.setdefault(anchor(row), {})[row["query"]] = row["score"]
     order = list(PREDICATES)
     for key, row in chosen.items():
-        row |= {"anchor": key, "note": note if key in failed else "", "scores": scores.get(key, {})}
+        row |= {
+            "anchor": key,
+            "note": f"Missed by {failed[key]['guide']}." if key in failed else "",
+            "scores": scores.get(key, {}),
+            "relevant": relevant.get(row["plan_id"], []),
+        }
     return sorted(chosen.values(), key=lambda r: (bool(r["note"]), order.index(r["predicate"])))
 
 
@@ -116,7 +127,7 @@ def draw_examples(dataset: Dataset, chosen: Sequence[dict[str, Any]]) -> list[Ex
 
 
 def _example(sample: Sample, row: dict[str, Any]) -> Example:
-    scores, moved = row["scores"], set(row["moved"])
+    scores, relevant = row["scores"], set(row["relevant"])
     words = [
         f"{action[0]} {action[1]}" + (f" on {action[2]}" if len(action) > 2 else "")
         for action in row["actions"]
@@ -127,7 +138,7 @@ def _example(sample: Sample, row: dict[str, Any]) -> Example:
         scene_id=row["scene_id"],
         picture=outlined(
             sample,
-            relevant=moved,
+            relevant=relevant,
             subject=row["subject"],
             reference=row["reference"],
             scores=scores,
@@ -135,7 +146,7 @@ def _example(sample: Sample, row: dict[str, Any]) -> Example:
         plan=" → ".join(words),
         status=row["status"],
         scores=[
-            (box.name, _hex(box.color), box.name in moved, scores.get(box.name))
+            (box.name, _hex(box.color), box.name in relevant, scores.get(box.name))
             for box in sample.scene.objects
         ],
         note=row["note"],
@@ -188,9 +199,9 @@ def outlined(
             x, y = float(xs.mean()), float(ys.mean())
             letter = "S" if box.name == subject else "R"
             tags.append(
-                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7" fill="#fff" stroke="#22282f"/>'
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7" fill="#fff" stroke="{INK}"/>'
                 f'<text x="{x:.1f}" y="{y + 3.4:.1f}" text-anchor="middle" font-size="9.5" '
-                f'font-weight="700" font-family="system-ui, sans-serif" fill="#22282f">{letter}'
+                f'font-weight="700" font-family="system-ui, sans-serif" fill="{INK}">{letter}'
                 f"<title>{escape(box.name)}</title></text>"
             )
     return "".join([*parts, *tags, "</svg>"])

@@ -1,13 +1,12 @@
 """The report's plots as inline SVG, all in one quiet style.
 
 Text stays text and takes the page's font; ids start with the plot's name, so that many plots
-can share a page. A family has one colour everywhere, and so has a guide.
+can share a page. Colours are those of `style`.
 """
 
 from __future__ import annotations
 
 import io
-import math
 import re
 import textwrap
 from collections import Counter
@@ -21,60 +20,30 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from relevance.evaluation.comparisons import Comparison, Predictions, guided_cost, mean_interval
-from relevance.scene import PREDICATES as KNOWN
-
-PAPER_ACCURACY = {"same-plane": (0.90, 0.95, 0.94), "on": (0.76, 0.89, 0.87)}
-"""True relevant, true irrelevant and total of the paper's network."""
-PAPER_RELEVANT = {"same-plane": 0.14, "on": 0.30}
-"""Share of relevant queries in the paper's datasets."""
-PAPER_SECONDS = (3.1, 4.7)
-"""Range of the paper's mean planning times a task, s."""
-GROUPS = ("same-plane", "on")
-PREDICATES = tuple(KNOWN)
-
-DASH, TIMES = "\u2013", "\u00d7"
-INK, MUTED, FAINT = "#22282f", "#6b7480", "#d9dde2"
-GROUP_COLOR = {"same-plane": "#2f6db3", "on": "#c26a1c"}
-GUIDE_COLOR = {
-    "unguided": "#8a939d",
-    "prune": "#c26a1c",
-    "prune-then-full": "#2f6db3",
-    "expand": "#3a8a5f",
-    "order": "#7a5aa6",
-}
-SHARES = (
-    ("true relevant", "true_relevant", "#3a8a5f"),
-    ("true irrelevant", "true_irrelevant", "#8a939d"),
-    ("total", "total", "#22282f"),
+from relevance.evaluation import Comparison, Predictions, guided_cost
+from relevance.metrics import mean_interval
+from relevance.report.paper import paper
+from relevance.report.style import (
+    BAND,
+    FAINT,
+    GROUPS,
+    INK,
+    LOSS_COLOR,
+    MUTED,
+    PALE,
+    SHARES,
+    STYLE,
+    TIMES,
+    UNGUIDED,
+    VIOLET,
+    family_color,
+    guide_style,
+    seconds,
 )
+from relevance.scene import PREDICATES
+
 QUANTILES = np.linspace(0, 1, 201)
 """Shares at which distributions of times are drawn; the middle one is the median."""
-STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9,
-    "svg.fonttype": "none",
-    "text.color": INK,
-    "axes.edgecolor": FAINT,
-    "axes.labelcolor": MUTED,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "axes.titlecolor": INK,
-    "grid.color": "#eceff2",
-    "grid.linewidth": 0.8,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.major.size": 0,
-    "ytick.major.size": 0,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "lines.linewidth": 1.8,
-    "lines.solid_capstyle": "round",
-}
 
 
 def svg(
@@ -118,31 +87,19 @@ def _log_seconds(ax: Axes, which: str) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def seconds(value: float) -> str:
-    """Seconds in the unit that reads best."""
-    if not math.isfinite(value):
-        return DASH
-    if value == 0:
-        return "0"
-    if value >= 100:
-        return f"{value:.0f} s"
-    if value >= 1:
-        return f"{value:.2g} s" if value >= 10 else f"{value:.1f} s"
-    return f"{1000 * value:.0f} ms" if value >= 0.01 else f"{1000 * value:.1f} ms"
-
-
 def label_shares(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     groups = [row["predicate"] for row in rows]
     y = np.arange(len(rows))[::-1]
     shares = [row["relevant_share"] or 0.0 for row in rows]
-    colors = [GROUP_COLOR[KNOWN[group].family] for group in groups]
+    colors = [family_color(PREDICATES[group].family) for group in groups]
     ax.barh(y, shares, height=0.56, color=colors)
     end = max([*shares, 0.3]) * 1.08
     for at, row, share in zip(y, rows, shares, strict=True):
         text = f"{100 * share:.1f}% of {row['queries']}"
         ax.text(end * 1.03, at, text, va="center", fontsize=8.5)
-        paper = PAPER_RELEVANT[KNOWN[row["predicate"]].family]
-        ax.plot([paper, paper], [at - 0.38, at + 0.38], color=INK, linewidth=1.6)
+        theirs = paper().train.get(row["predicate"])
+        if theirs:
+            ax.plot([theirs.share] * 2, [at - 0.38, at + 0.38], color=INK, linewidth=1.6)
     ax.set_yticks(y, groups)
     ax.set_xlim(0, end)
     ax.grid(axis="y", visible=False)
@@ -156,14 +113,14 @@ def lengths(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     for number, group in enumerate(GROUPS):
         counts = Counter()
         for row in rows:
-            if KNOWN[row["predicate"]].family == group:
+            if PREDICATES[row["predicate"]].family == group:
                 counts[row["n_actions"]] += row["plans"]
         total = sum(counts.values())
         if total:
             at = np.arange(len(lengths)) + (number - 0.5) * width
             shares = [counts[length] / total for length in lengths]
             label = f"{group} (n = {total})"
-            ax.bar(at, shares, width * 0.92, color=GROUP_COLOR[group], label=label)
+            ax.bar(at, shares, width * 0.92, color=family_color(group), label=label)
     ax.set_xticks(range(len(lengths)), [str(length) for length in lengths])
     ax.set_xlabel("actions in the plan")
     ax.set_ylabel("share of solved tasks")
@@ -176,7 +133,7 @@ def lengths(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
 def reasons(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     y = np.arange(len(rows))[::-1]
     counts = [row["goals"] for row in rows]
-    ax.barh(y, counts, height=0.56, color="#9aa4af")
+    ax.barh(y, counts, height=0.56, color=PALE)
     for at, count in zip(y, counts, strict=True):
         ax.text(count + max(counts) * 0.01, at, str(count), va="center", fontsize=8.5)
     ax.set_yticks(y, [textwrap.fill(row["label"], 26) for row in rows])
@@ -188,12 +145,13 @@ def reasons(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def times(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     """Distribution of planning times; rows hold a family's QUANTILES, s."""
-    ax.axvspan(*PAPER_SECONDS, color="#f0e4d4", zorder=0)
-    ax.text(PAPER_SECONDS[0] * 0.88, 0.03, "paper, means", ha="right", color=MUTED, fontsize=8.5)
+    low, high = paper().seconds
+    ax.axvspan(low, high, color=BAND, zorder=0)
+    ax.text(low * 0.88, 0.03, "paper, means", ha="right", color=MUTED, fontsize=8.5)
     for row in rows:
         found, group = row["quantiles"], row["family"]
         label = f"{group}: median {seconds(found[len(found) // 2])} (n = {row['n']})"
-        ax.plot(found, QUANTILES, color=GROUP_COLOR[group], label=label)
+        ax.plot(found, QUANTILES, color=family_color(group), label=label)
     ax.set_xlabel("planning time of a task")
     ax.set_ylabel("share of tasks done")
     ax.legend(loc="upper center", bbox_to_anchor=(0.45, -0.2))
@@ -208,10 +166,11 @@ def accuracy(ax: Axes, predictions: Predictions) -> None:
         for row, group in enumerate(groups):
             y = len(groups) - 1 - row + (1 - number) * 0.22
             value = getattr(predictions.of(group).accuracy(), attribute)
-            paper = PAPER_ACCURACY[KNOWN[group].family][number]
-            ax.plot([paper, value], [y, y], color=FAINT, linewidth=1.2, zorder=1)
             ax.plot(value, y, "o", color=color, markersize=6, label=label if not row else None)
-            ax.plot(paper, y, "|", color=color, markersize=9, markeredgewidth=1.6)
+            if group in paper().accuracy:
+                theirs = paper().accuracy[group][number]
+                ax.plot([theirs, value], [y, y], color=FAINT, linewidth=1.2, zorder=1)
+                ax.plot(theirs, y, "|", color=color, markersize=9, markeredgewidth=1.6)
     for row, group in enumerate(groups):
         base = predictions.of(group).accuracy().base_rate
         y = len(groups) - 1 - row
@@ -237,7 +196,7 @@ def beta_accuracy(*axes: Axes, predictions: Predictions) -> None:
             for label, attribute, color in SHARES:
                 ax.plot(betas, [getattr(a, attribute) for a in found], color=color, label=label)
             whole = [a.tasks_whole for a in found]
-            ax.plot(betas, whole, "--", color="#7a5aa6", linewidth=1.4, label="whole tasks kept")
+            ax.plot(betas, whole, "--", color=VIOLET, linewidth=1.4, label="whole tasks kept")
         ax.axvline(0, color=FAINT, linewidth=1)
         ax.set_ylim(0, 1.02)
         _percent_axis(ax.yaxis)
@@ -252,7 +211,7 @@ def scores(*axes: Axes, predictions: Predictions) -> None:
         if len(part):
             low, high = np.clip([part.score.min(), part.score.max()], -15, 15)
             bins = np.linspace(low - 1e-6, high + 1e-6, 41).tolist()
-            for value, name, color in ((False, "irrelevant", "#9aa4af"), (True, "relevant", INK)):
+            for value, name, color in ((False, "irrelevant", PALE), (True, "relevant", INK)):
                 scores = np.clip(part.score[part.relevant == value], low, high)
                 if len(scores):
                     label = f"{name} (n = {len(scores)})"
@@ -271,12 +230,12 @@ def runtimes(*axes: Axes, comparisons: dict[str, list[Comparison]]) -> None:
     ticks = []
     for at, (group, found) in enumerate(comparisons.items()):
         first = found[0]
-        bars = [("unguided", first.unguided, first.nlps_unguided)]
+        bars = [(UNGUIDED, first.unguided, first.nlps_unguided)]
         bars += [(c.guide, c.guided, c.nlps_guided) for c in found]
         width = 0.8 / len(bars)
         for number, (name, interval, nlps) in enumerate(bars):
             x = at + (number - (len(bars) - 1) / 2) * width
-            style = {"width": width * 0.9, "color": GUIDE_COLOR[name]}
+            style = {"width": width * 0.9, "color": guide_style(name).color}
             time_ax.bar(x, interval.value, label=None if at else name, **style)
             spread = [[interval.value - interval.low], [interval.high - interval.value]]
             time_ax.errorbar(x, interval.value, spread, color=INK, linewidth=1, capsize=2.5)
@@ -293,12 +252,12 @@ def runtimes(*axes: Axes, comparisons: dict[str, list[Comparison]]) -> None:
 def by_objects(ax: Axes, rows: dict[str, list[dict[str, Any]]]) -> None:
     """Mean CPU time by the number of objects, with intervals; `rows` per guide, solvable tasks."""
     first = next(iter(rows.values()))
-    series = {"unguided": (first, lambda row: row["seconds_unguided"])}
+    series = {UNGUIDED: (first, lambda row: row["seconds_unguided"])}
     series |= {guide: (chosen, guided_cost) for guide, chosen in rows.items()}
     for name, (chosen, cost) in series.items():
         counts = sorted({row["n_objects"] for row in chosen})
         means = [mean_interval(cost(r) for r in chosen if r["n_objects"] == n) for n in counts]
-        color = GUIDE_COLOR[name]
+        color = guide_style(name).color
         ax.plot(counts, [m.value for m in means], "o-", markersize=4, color=color, label=name)
         lows, highs = [m.low for m in means], [m.high for m in means]
         ax.fill_between(counts, lows, highs, color=color, alpha=0.15, linewidth=0)
@@ -323,7 +282,7 @@ def pairs(ax: Axes, rows: dict[str, list[dict[str, Any]]]) -> None:
             if part:
                 x = [row["seconds_unguided"] for row in part]
                 y = [row["seconds_guided"] for row in part]
-                style = {"s": 16, "marker": marker, "color": GUIDE_COLOR[name], "alpha": 0.7}
+                style = {"s": 16, "marker": marker, "color": guide_style(name).color, "alpha": 0.7}
                 ax.scatter(x, y, label=label, rasterized=len(part) > 2000, **style)
     ax.set_xlim(low, high)
     ax.set_ylim(low, high)
@@ -337,7 +296,7 @@ def pairs(ax: Axes, rows: dict[str, list[dict[str, Any]]]) -> None:
 def beta_reruns(*axes: Axes, sweep: dict[str, list[Comparison]]) -> None:
     time_ax, miss_ax = axes
     for group, found in sweep.items():
-        betas, color = [c.beta for c in found], GROUP_COLOR[group]
+        betas, color = [c.beta for c in found], family_color(group)
         label = f"{group} (n = {found[0].n_solvable})"
         speedups = [c.speedup_both for c in found]
         time_ax.plot(
@@ -360,11 +319,10 @@ def beta_reruns(*axes: Axes, sweep: dict[str, list[Comparison]]) -> None:
 
 def training_curve(ax: Axes, history: Sequence[Mapping[str, float]]) -> None:
     """Training loss and its parts by step."""
-    colors = {"loss": INK, "relevance": "#2f6db3", "mask": "#c26a1c", "geometry": "#3a8a5f"}
     names = [name for name in history[0] if name != "step"]
     for name in names:
         steps, values = [h["step"] for h in history], [h[name] for h in history]
-        ax.plot(steps, values, color=colors.get(name, MUTED), linewidth=1.5, label=name)
+        ax.plot(steps, values, color=LOSS_COLOR.get(name, MUTED), linewidth=1.5, label=name)
     ax.set_yscale("log")
     for format in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
         format(FuncFormatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "125" else ""))

@@ -30,12 +30,12 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.stats import rankdata
 from torch import Tensor
 from torch.nn import functional as F
 
 from relevance.errors import RelevanceError
 from relevance.hashing import content_hash
+from relevance.metrics import accuracy
 from relevance.models import (
     GEOMETRY,
     ModelConfig,
@@ -380,7 +380,7 @@ def train(
     path, unfinished = folder / f"{checkpoint_id}.pt", folder / f"{checkpoint_id}.state"
     if path.exists():
         _, meta = load_checkpoint(path)
-        _write_row(dataset, path, meta)
+        write_row(dataset, path, meta)
         return path
     examples = _load(dataset, "train", config, folder)
     if not examples.goals:
@@ -414,7 +414,7 @@ def train(
         "history": trainer.history,
     }
     _save(path, {"kind": "checkpoint", "meta": meta, "model": trainer.model.state_dict()})
-    _write_row(dataset, path, meta)
+    write_row(dataset, path, meta)
     unfinished.unlink(missing_ok=True)
     return path
 
@@ -441,8 +441,8 @@ def _threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _write_row(dataset: Dataset, path: Path, meta: Mapping[str, Any]) -> None:
-    """The checkpoint's row; nothing to do when it is there."""
+def write_row(dataset: Dataset, path: Path, meta: Mapping[str, Any]) -> None:
+    """Give a dataset the row of a checkpoint; nothing to do when it is there."""
     if dataset.has("checkpoints", name=meta["checkpoint_id"]):
         return
     inside = path.resolve().is_relative_to(dataset.path.resolve())
@@ -549,49 +549,3 @@ def _metrics(parts: list[tuple[np.ndarray, ...]]) -> dict[str, Any]:
         "queries": accuracy(score[query], relevant[query]),
         "with_goal_objects": accuracy(score, relevant),
     }
-
-
-def accuracy(score: np.ndarray, relevant: np.ndarray) -> dict[str, float | int | None]:
-    """Shares scored right, of the relevant, the irrelevant and all; None where there are none.
-
-    `base_rate` is what always answering irrelevant gets right, `balanced` the mean of true
-    relevant and true irrelevant, `auc` the chance that a relevant object outscores another.
-    `best_beta` has the highest total here (an object is kept iff score > -beta); eta makes
-    beta = 0 lean towards keeping.
-    """
-    kept, n, k = score > 0, len(score), int(relevant.sum())
-
-    def share(right: np.ndarray) -> float | None:
-        return float(right.mean()) if len(right) else None
-
-    true_relevant, true_irrelevant = share(kept[relevant]), share(~kept[~relevant])
-    both = None not in (true_relevant, true_irrelevant)
-    return {
-        "relevant": k,
-        "irrelevant": n - k,
-        "true_relevant": true_relevant,
-        "true_irrelevant": true_irrelevant,
-        "total": share(kept == relevant),
-        "base_rate": share(~relevant),
-        "balanced": ((true_relevant or 0) + (true_irrelevant or 0)) / 2 if both else None,
-        "auc": float((rankdata(score)[relevant].sum() - k * (k + 1) / 2) / (k * (n - k)))
-        if both
-        else None,
-        "best_beta": _best_beta(score, relevant),
-    }
-
-
-def _best_beta(score: np.ndarray, relevant: np.ndarray) -> float | None:
-    """The beta half-way between the scores where most objects are judged rightly."""
-    if not len(score):
-        return None
-    order = np.argsort(-score, kind="stable")
-    ranked = np.r_[np.inf, score[order], -np.inf]
-    gained = np.r_[0, np.cumsum(np.where(relevant[order], 1, -1))]
-    # Objects of equal score are kept together.
-    splits = ranked[:-1] > ranked[1:]
-    best = int(np.argmax(np.where(splits, gained, -len(score))))
-    above, below = ranked[best], ranked[best + 1]
-    if np.isinf(above) or np.isinf(below):
-        return float(-below - 1.0) if np.isinf(above) else float(-above + 1.0)
-    return float(-(above + below) / 2)

@@ -1,0 +1,207 @@
+"""What a checkpoint says of every labelled object: scored into rows, and read back as columns.
+
+Judged by the labels of the policy that the checkpoint learned, as they are when they are read.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from relevance.evaluation.scorer import EvaluationError, enter, open_checkpoint, policy_of
+from relevance.metrics import Accuracy
+from relevance.scene import PREDICATES, Goal
+from relevance.store import Dataset, Labelling
+
+Progress = Callable[[int, int], None]
+
+_PREDICTED = (
+    "scene_id",
+    "split",
+    "predicate",
+    "subject",
+    "reference",
+    "query",
+    "is_goal_object",
+    "relevant",
+)
+
+
+def predict(
+    root: str | Path,
+    checkpoint: str | Path,
+    *,
+    split: str = "test",
+    shards: Sequence[int] | None = None,
+    progress: Progress | None = None,
+) -> int:
+    """Score every labelled object of a split's shards into `predictions`; returns the row count.
+
+    Labels are those of the checkpoint's policy; EvaluationError when the split has none.
+    """
+    dataset = Dataset.open(root)
+    scorer, meta = open_checkpoint(checkpoint)
+    of = labelled_by(dataset, scorer.policy)
+    if not dataset.files("labels", of=of, split=split):
+        raise EvaluationError(
+            f"{dataset.path}: no labels of split {split} by policy {scorer.policy}, which the "
+            f"checkpoint learned; `relevance label {dataset.path} --policy {scorer.policy}` "
+            "makes them"
+        )
+    enter(dataset, checkpoint, meta)
+    shards, count = dataset.shards(split) if shards is None else shards, 0
+    for number, shard in enumerate(shards, 1):
+        labels: dict[str, dict[Goal, dict[str, dict[str, Any]]]] = defaultdict(dict)
+        for row in dataset.read_rows("labels", of=of, split=split, shard=shard):
+            labels[row["scene_id"]].setdefault(_goal(row), {})[row["query"]] = row
+        rows: list[dict[str, Any]] = []
+        for sample in dataset.samples(split, [shard]) if labels else ():
+            goals = labels.get(sample.scene.id, {})
+            if not goals:
+                continue
+            scorer.observe(sample.scene, sample.image, sample.views)
+            scores = scorer.score_goals(sample.scene, list(goals))
+            for queries, values in zip(goals.values(), scores.tolist(), strict=True):
+                scored = dict(zip(sample.scene.names, values, strict=True))
+                rows += [
+                    {name: label[name] for name in _PREDICTED}
+                    | {"checkpoint_id": scorer.checkpoint_id, "score": scored[query]}
+                    for query, label in queries.items()
+                ]
+        dataset.write_rows("predictions", rows, name=scorer.checkpoint_id, split=split, shard=shard)
+        count += len(rows)
+        if progress:
+            progress(number, len(shards))
+    return count
+
+
+def labelled_by(dataset: Dataset, policy: str) -> Labelling | None:
+    """The labelling of a policy by the dataset's present planner; None: the current labels."""
+    current = dataset.labelling
+    if current is None or current.policy == policy:
+        return None
+    return replace(current, policy=policy)
+
+
+def policy_of_checkpoint(dataset: Dataset, checkpoint_id: str) -> str:
+    """The policy that a checkpoint of the dataset learned, by its row."""
+    for row in dataset.read_rows("checkpoints", checkpoint_id=checkpoint_id):
+        return policy_of(json.loads(row["config"] or "{}"))
+    return policy_of(None)
+
+
+def _goal(row: dict[str, Any]) -> Goal:
+    return Goal(
+        predicate=PREDICATES[row["predicate"]], subject=row["subject"], reference=row["reference"]
+    )
+
+
+# --- reading ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Predictions:
+    """Predictions of one checkpoint as columns, (R,) each."""
+
+    predicate: np.ndarray
+    task: np.ndarray
+    """Number of the task that the row belongs to."""
+    relevant: np.ndarray
+    score: np.ndarray
+    is_goal_object: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+    def where(self, mask: np.ndarray) -> Predictions:
+        """The rows that a boolean mask (R,) selects."""
+        return Predictions(
+            predicate=self.predicate[mask],
+            task=self.task[mask],
+            relevant=self.relevant[mask],
+            score=self.score[mask],
+            is_goal_object=self.is_goal_object[mask],
+        )
+
+    def of(self, group: str) -> Predictions:
+        """Rows of one predicate, or of the family `same-plane`; `all` gives everything."""
+        if group == "all":
+            return self
+        return self.where(np.array([in_group(name, group) for name in self.predicate], bool))
+
+    def queries(self) -> Predictions:
+        """Rows other than those of subject and reference."""
+        return self.where(~self.is_goal_object)
+
+    def accuracy(self, beta: float = 0.0) -> Accuracy:
+        """Shares judged rightly when an object is kept iff score > -beta."""
+        return Accuracy.of(self.score, self.relevant, beta=beta, task=self.task)
+
+
+def in_group(predicate: str, group: str) -> bool:
+    """Whether a predicate belongs to `all`, to a family or is the group itself."""
+    if group in ("all", predicate):
+        return True
+    return predicate in PREDICATES and PREDICATES[predicate].family == group
+
+
+def read_predictions(dataset: Dataset, checkpoint_id: str, *, split: str = "test") -> Predictions:
+    """Predictions of a checkpoint on a split, in a fixed order.
+
+    Each is judged by the present label of the checkpoint's policy; a score without such a label
+    is left out, see `unjudged`.
+    """
+    policy = policy_of_checkpoint(dataset, checkpoint_id)
+    with dataset.connect(policy=policy) as connection:
+        columns = connection.execute(
+            """
+            select predicate, l.relevant, score, l.is_goal_object,
+                dense_rank() over (order by scene_id, predicate, subject, reference) as task
+            from predictions
+            join labels l using (split, scene_id, predicate, subject, reference, query)
+            where checkpoint_id = ? and split = ? and l.policy = ?
+            order by task, query
+            """,
+            [checkpoint_id, split, policy],
+        ).fetchnumpy()
+    return Predictions(
+        predicate=np.asarray(columns["predicate"], dtype=str),
+        task=np.asarray(columns["task"], dtype=int),
+        relevant=np.asarray(columns["relevant"], dtype=bool),
+        score=np.asarray(columns["score"], dtype=float),
+        is_goal_object=np.asarray(columns["is_goal_object"], dtype=bool),
+    )
+
+
+def unjudged(dataset: Dataset, checkpoint_id: str, *, split: str = "test") -> list[str]:
+    """What keeps the predictions of a checkpoint from being those of the present labels, in words.
+
+    Labels are younger than predictions after another planner or policy made them.
+    """
+    policy = policy_of_checkpoint(dataset, checkpoint_id)
+    with dataset.connect(policy=policy) as connection:
+        ((scores, labels, both, changed),) = connection.execute(
+            """
+            with p as (from predictions where checkpoint_id = $1 and split = $2),
+                l as (from labels where policy = $3 and split = $2)
+            select (select count(*) from p), (select count(*) from l), count(*),
+                count_if(p.relevant <> l.relevant)
+            from p join l using (scene_id, predicate, subject, reference, query)
+            """,
+            [checkpoint_id, split, policy],
+        ).fetchall()
+    if not scores:
+        return []
+    again = "`relevance evaluate` scores them anew"
+    found = [
+        (scores - both, f"predictions have no label of policy {policy} any more and are left out"),
+        (labels - both, f"labels of policy {policy} have no prediction yet; {again}"),
+        (changed, f"labels changed since they were predicted; the present ones count; {again}"),
+    ]
+    return [f"{count} {what}" for count, what in found if count]

@@ -1,0 +1,239 @@
+"""A checkpoint as the planner's scorer: it looks at a scene once and answers all its goals.
+
+What was seen is kept by what the scene shows (boxes, table, camera, light), never by the
+scene's id, which its author chooses.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections import OrderedDict
+from collections.abc import Hashable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from relevance.errors import RelevanceError, RelevanceWarning
+from relevance.planner import Guide
+from relevance.sampling import Randomisation
+from relevance.scene import Box, Camera, Goal, Scene
+from relevance.store import Dataset
+
+if TYPE_CHECKING:  # models imports torch, which the planner and the report do without
+    from relevance.models import RelevanceModel
+
+
+class EvaluationError(RelevanceError):
+    """Settings or data that cannot be evaluated: says which, and what was expected."""
+
+
+class NetworkScorer:
+    """Scores from a checkpoint; encodes a scene once and answers all its goals from that.
+
+    Scenes that were not shown to `observe` are rendered. Keeps the last `capacity` scenes. A
+    scene whose picture would have another size than the model takes is refused; one whose
+    camera stands elsewhere, or whose boxes look the same, gives a RelevanceWarning.
+    """
+
+    def __init__(
+        self,
+        model: RelevanceModel,
+        *,
+        checkpoint_id: str = "",
+        policy: str = "found",
+        capacity: int = 64,
+    ) -> None:
+        self.model = model
+        self.checkpoint_id = checkpoint_id
+        self.policy = policy
+        """The label policy that it learned."""
+        self.capacity = capacity
+        self.seconds = 0.0
+        """CPU seconds of the last `scores`, a needed encoding included, rendering left out."""
+        self._seen: OrderedDict[Hashable, tuple[np.ndarray, np.ndarray]] = OrderedDict()
+        self._encodings: OrderedDict[Hashable, Any] = OrderedDict()
+        self._warned: set[Camera] = set()
+
+    def observe(self, scene: Scene, image: np.ndarray, views: np.ndarray) -> None:
+        """Give a scene's image (H, W, 3) and its objects' views (N, 32, 32, 3), uint8 RGB."""
+        self._check(scene)
+        wanted = self.model.config.camera
+        if image.shape[:2] != (wanted.height, wanted.width):
+            raise EvaluationError(
+                f"scene {scene.id}: image is {image.shape[1]}x{image.shape[0]}, "
+                f"the model takes {wanted.width}x{wanted.height}"
+            )
+        if len(views) != len(scene.objects):
+            raise EvaluationError(
+                f"scene {scene.id}: {len(views)} views, expected one for each of its "
+                f"{len(scene.objects)} objects"
+            )
+        key = shown(scene)
+        self._keep(self._seen, key, (image, views))
+        self._encodings.pop(key, None)
+
+    def forget(self) -> None:
+        """Drop every encoding, so that the next call of `scores` pays for its own."""
+        self._encodings.clear()
+
+    def scores(self, scene: Scene, goal: Goal) -> dict[str, float]:
+        """Logit of every object of the scene."""
+        return dict(zip(scene.names, self.score_goals(scene, [goal])[0].tolist(), strict=True))
+
+    def score_goals(self, scene: Scene, goals: Sequence[Goal]) -> np.ndarray:
+        """Logits of every object for several goals, (G, N); EvaluationError for nan."""
+        key = shown(scene)
+        if key not in self._seen:
+            from relevance.simulation import Renderer  # pybullet: only when there is no picture
+
+            self._check(scene)  # before a picture is drawn that no model takes
+            with Renderer() as renderer:
+                rendering = renderer.render(scene)
+            self.observe(scene, rendering.image, rendering.views)
+        import torch
+
+        start = time.process_time()
+        device = next(self.model.parameters()).device
+        with torch.inference_mode():
+            if key not in self._encodings:
+                image, views = (torch.from_numpy(p).to(device) for p in self._seen[key])
+                encoding = self.model.encode(
+                    image.permute(2, 0, 1)[None], views.permute(0, 3, 1, 2)[None]
+                )
+                self._keep(self._encodings, key, encoding)
+            encoding = self._encodings[key]
+            scores = np.empty((len(goals), len(scene.objects)))
+            for predicate in dict.fromkeys(goal.predicate for goal in goals):
+                which = [n for n, goal in enumerate(goals) if goal.predicate == predicate]
+                pairs = [
+                    [scene.names.index(name) for name in (goals[n].subject, goals[n].reference)]
+                    for n in which
+                ]
+                asked = torch.tensor([pairs], device=device)
+                scores[which] = self.model.decode(encoding, predicate, asked)[0].cpu()
+        self.seconds = time.process_time() - start
+        if not np.isfinite(scores).all():
+            raise EvaluationError(
+                f"checkpoint {self.checkpoint_id or '(unnamed)'}: its scores of scene {scene.id} "
+                "are not finite, expected numbers: its weights are broken"
+            )
+        return scores
+
+    def _check(self, scene: Scene) -> None:
+        """Refuse a picture of another size; warn of another camera and of lookalikes."""
+        mine, its = self.model.config.camera, scene.camera
+        if (its.width, its.height) != (mine.width, mine.height):
+            raise EvaluationError(
+                f"scene {scene.id}: its camera takes {its.width}x{its.height} pixels, "
+                f"the model was trained on {mine.width}x{mine.height}"
+            )
+        if not same_view(mine, its) and its not in self._warned:
+            self._warned.add(its)
+            warn(
+                f"scene {scene.id}: its camera ({_pose(its)}) is not the one that the model was "
+                f"trained with ({_pose(mine)}); its scores may mean nothing"
+            )
+        if shown(scene) not in self._seen:
+            for names in lookalikes(scene):
+                warn(
+                    f"scene {scene.id}: {', '.join(names)} look the same, so that the network "
+                    "cannot tell them apart; give them other colours or sizes"
+                )
+
+    def _keep(self, cache: OrderedDict[Hashable, Any], key: Hashable, value: Any) -> None:
+        cache[key] = value
+        cache.move_to_end(key)
+        while len(cache) > self.capacity:
+            cache.popitem(last=False)
+
+
+def shown(scene: Scene) -> Hashable:
+    """All that a scene's picture depends on; its id and goals are not part of it."""
+    return scene.objects, scene.table, scene.camera, scene.light, scene.robot
+
+
+def same_view(a: Camera, b: Camera) -> bool:
+    """Whether two cameras differ by no more than what randomised scenes teach to forgive."""
+    allowed, rounding = Randomisation(), 1e-4
+    shift = max(
+        abs(one - other)
+        for one, other in zip((*a.eye, *a.target), (*b.eye, *b.target), strict=True)
+    )
+    return (
+        shift <= allowed.camera_shift + rounding
+        and abs(a.fov - b.fov) <= allowed.camera_fov + rounding
+    )
+
+
+def _pose(camera: Camera) -> str:
+    eye, target = (", ".join(f"{v:g}" for v in at) for at in (camera.eye, camera.target))
+    return f"eye {eye}; target {target}; fov {camera.fov:g}"
+
+
+def lookalikes(scene: Scene) -> list[tuple[str, ...]]:
+    """Names of boxes of equal size and colour, which equal views stand for."""
+    groups: dict[tuple[Any, ...], list[str]] = {}
+    for box in scene.objects:
+        groups.setdefault(_looks(box), []).append(box.name)
+    return [tuple(names) for names in groups.values() if len(names) > 1]
+
+
+def _looks(box: Box) -> tuple[Any, ...]:
+    """Size to 1 mm, footprint edges in any order, and colour to one of 255 steps."""
+    x, y, z = (round(1000 * edge) for edge in box.size)
+    return min(x, y), max(x, y), z, tuple(round(255 * channel) for channel in box.color)
+
+
+def warn(message: str) -> None:
+    """A RelevanceWarning, shown once for each message."""
+    warnings.warn(message, RelevanceWarning, stacklevel=2)
+
+
+def open_checkpoint(checkpoint: str | Path) -> tuple[NetworkScorer, dict[str, Any]]:
+    """A checkpoint's scorer, and what is known of it (id, config, metrics, hashes)."""
+    from relevance.training import load_checkpoint
+
+    model, meta = load_checkpoint(checkpoint)
+    policy = policy_of(meta["config"])
+    return NetworkScorer(model, checkpoint_id=meta["checkpoint_id"], policy=policy), meta
+
+
+def load_scorer(checkpoint: str | Path, *, into: Dataset | None = None) -> NetworkScorer:
+    """Read a checkpoint; CheckpointError names the file and the found and expected version.
+
+    `into` is a dataset that gets the checkpoint's row, where it has none yet.
+    """
+    scorer, meta = open_checkpoint(checkpoint)
+    if into is not None:
+        enter(into, checkpoint, meta)
+    return scorer
+
+
+def enter(dataset: Dataset, checkpoint: str | Path, meta: dict[str, Any]) -> None:
+    """Give a dataset the row of a checkpoint, where it has none yet."""
+    from relevance.training import write_row
+
+    write_row(dataset, Path(checkpoint), meta)
+
+
+def policy_of(config: dict[str, Any] | None) -> str:
+    """The label policy that the training settings of a checkpoint name."""
+    return (config or {}).get("policy", "found")
+
+
+def checkpoint_id(checkpoint: str | Path) -> str:
+    """The name that a checkpoint has inside; its file may be called anything."""
+    return open_checkpoint(checkpoint)[0].checkpoint_id
+
+
+def load_guide(
+    checkpoint: str | Path, *, mode: str = "prune-then-full", beta: float = 0.0
+) -> Guide:
+    """A guide for `plan` from a checkpoint file; EvaluationError unless beta is finite."""
+    if not math.isfinite(beta):
+        raise EvaluationError(f"beta: {beta}, expected a finite number")
+    chosen: Any = mode  # the planner checks the name
+    return Guide(scorer=load_scorer(checkpoint), mode=chosen, beta=beta)
