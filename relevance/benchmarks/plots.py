@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 import numpy as np
@@ -12,11 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from relevance.benchmarks.runs import Planned, Plot
 from relevance.report.plots import MUTED, STYLE
-
-if TYPE_CHECKING:
-    from relevance.benchmarks.runs import Plot
-    from relevance.benchmarks.speed import Planned
 
 BLUE, ORANGE, GREEN, GREY = "#2f6db3", "#c26a1c", "#3a8a5f", "#8a939d"
 BOUND_COLOR = {"pose": GREEN, "keyframe": ORANGE, "path": BLUE, "rest": GREY}
@@ -102,11 +98,13 @@ def scaling(time: Axes, nodes: Axes, solved: Axes, *, rows: Sequence[Planned]) -
     time.legend(loc="upper left")
 
 
-def against(left: Axes, right: Axes, *, ours: Sequence[float], theirs: Sequence[float]) -> None:
+def against(
+    left: Axes, right: Axes, *, ours: Sequence[float], theirs: Sequence[float], name: str
+) -> None:
     """CPU time of both planners: distributions, and task by task."""
-    for name, times, color in (("ours", ours, BLUE), ("rai", theirs, ORANGE)):
-        left.ecdf(np.array(times), label=name, color=color)
+    for label, times, color in (("ours", ours, BLUE), (name, theirs, ORANGE)):
+        left.ecdf(np.array(times), label=label, color=color)
     left.set(xscale="log", xlabel="CPU time a task, s", ylabel="share of tasks at most")
     left.legend(loc="lower right")
     right.scatter(ours, theirs, s=12, color=BLUE, linewidths=0)
-    right.set(xscale="log", yscale="log", xlabel="ours, s", ylabel="rai, s")
+    right.set(xscale="log", yscale="log", xlabel="ours, s", ylabel=f"{name}, s")

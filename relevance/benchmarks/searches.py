@@ -9,8 +9,16 @@ from functools import partial
 import numpy as np
 
 from relevance.benchmarks import plots
-from relevance.benchmarks.runs import Measured, Plot, Progress, interval, share
-from relevance.benchmarks.speed import DEFAULTS, Planned, planned
+from relevance.benchmarks.runs import (
+    DEFAULTS,
+    Measured,
+    Planned,
+    Plot,
+    Progress,
+    interval,
+    planned,
+    share,
+)
 from relevance.benchmarks.tasks import Task
 from relevance.planner import PlannerConfig, warm_up
 from relevance.report.tables import Table
