@@ -34,7 +34,7 @@ from relevance.scene import Goal, Scene
 from relevance.simulation import replay
 
 Peer = Callable[[Scene, Goal], PlanResult]
-DRAWN = 20
+DRAWN = 100
 """Tasks drawn, at most, for each that ours is to leave unsolved."""
 
 

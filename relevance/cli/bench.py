@@ -67,7 +67,7 @@ def bench_planner(_: Any) -> Callable[..., int]:
                 reach, as other people make them (scaling and growth: always ours).
             against: Another planner that takes turns with ours on the same tasks.
             unsolved: With --against: how many tasks that ours leaves unsolved the other is asked
-                besides, two at a time (at most 20 times as many are drawn for it).
+                besides, two at a time (at most 100 times as many are drawn for it).
             limit: CPU seconds that the other planner has for a task.
             versus: Folder of another checkout of this project, whose planner takes turns with
                 this one on the same tasks, and on a tenth as many of 30 boxes.
