@@ -143,23 +143,23 @@ def test_shares_say_how_many_of_how_many():
 def test_completeness_counts_what_is_refuted_and_what_is_longer():
     row = Compared(
         task=0, scene_id="", goal="", predicate="on", n_objects=3, status="solved", reason="",
-        ambiguous=False, moved=("red",), reference=0, robust=0,
+        ambiguous=False, moved=("red",), reference=0, robust=0, alone=None,
     )  # fmt: skip
-    refused = replace(row, status="infeasible", moved=())
+    refused = replace(row, status="infeasible", moved=(), alone=True)
     rows = [
         row,
         replace(row, moved=("a", "red")),
         replace(row, moved=("a", "red"), robust=1),
         refused,
         replace(refused, ambiguous=True, robust=None),
-        replace(refused, reference=None, robust=None),
+        replace(refused, reference=None, robust=None, alone=False),
         replace(refused, status="limit"),
         replace(row, reference=None, robust=None),
     ]
     lines = completeness_table(rows).rows
     assert [line[1].split(" = ")[0] for line in lines] == [
-        "3 of 8", "2 of 3", "1 of 3", "1 of 3", "1 of 1", "4 of 8", "2 of 4", "1 of 4", "1",
-        "5 of 8", "2 of 5", "1",
+        "3 of 8", "2 of 3", "1 of 3", "1 of 3", "1 of 3", "1 of 1", "4 of 8", "2 of 4", "1 of 4",
+        "1", "5 of 8", "2 of 5", "1",
     ]  # fmt: skip
 
 
@@ -360,7 +360,7 @@ def test_bench_writes_rows_tables_plots_and_scenes_that_plan_reads(tmp_path, cap
 def test_exceptions_are_scenes_that_plan_reads(tasks, tmp_path, capsys):
     row = Compared(
         task=0, scene_id="", goal="", predicate="on", n_objects=3, status="solved", reason="",
-        ambiguous=False, moved=(), reference=0, robust=0,
+        ambiguous=False, moved=(), reference=0, robust=0, alone=None,
     )  # fmt: skip
     for some in (tasks[:1], tasks[1:3], []):  # of several parts, one of them without any
         part = Measured(name="part", rows=(row,), tables=(), exceptions=tuple(some))

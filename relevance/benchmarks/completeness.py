@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from relevance.benchmarks.reference import CLEARANCE, shortest
+from relevance.benchmarks.reference import CLEARANCE, possible, shortest
 from relevance.benchmarks.runs import DEFAULTS, Measured, Progress, share, timed_plan
 from relevance.benchmarks.tasks import Task
 from relevance.planner import PlannerConfig, warm_up
@@ -32,6 +32,8 @@ class Compared:
     """Fewest boxes to move before the subject, by the reference; None: it finds nothing."""
     robust: int | None
     """The same with ROBUST clearance."""
+    alone: bool | None
+    """Whether it could be done if no box but subject and reference were there; None: solved."""
 
     @property
     def solved(self) -> bool:
@@ -84,6 +86,7 @@ def compared(task: Task, config: PlannerConfig) -> Compared:
     """Plan one task and solve it by exhaustion, twice."""
     result, _, _ = timed_plan(task, config)
     most = config.max_actions // 2 - 1
+    others = [n for n in task.scene.names if n not in (task.goal.subject, task.goal.reference)]
     # What is solvable with more clearance is solvable with less.
     robust = shortest(task.scene, task.goal, ROBUST, most)
     reference = robust if robust == 0 else shortest(task.scene, task.goal, CLEARANCE, most)
@@ -99,6 +102,7 @@ def compared(task: Task, config: PlannerConfig) -> Compared:
         moved=result.moved,
         reference=reference,
         robust=robust,
+        alone=None if result.status == "solved" else possible(task.scene, task.goal, others),
     )
 
 
@@ -118,6 +122,10 @@ def completeness_table(rows: Sequence[Compared], config: PlannerConfig = DEFAULT
         ("of these solvable by the reference", share(found, len(infeasible))),
         ("of these solvable with 2 mm to spare", share(_refuted(infeasible), len(infeasible))),
         ("of these not flagged ambiguous", share(_plain(infeasible), len(infeasible))),
+        (
+            "of these impossible even with all other boxes gone",
+            share(sum(row.alone is False for row in infeasible), len(infeasible)),
+        ),
         ("stopped at a limit, solvable with 2 mm to spare", share(_refuted(limit), len(limit))),
         ("solved", share(len(solved), len(rows))),
         ("of these fewer boxes must move", share(len(over), len(solved))),
