@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from relevance.benchmarks import plots
+from relevance.benchmarks.plots import against_plot
 from relevance.benchmarks.runs import (
     DEFAULTS,
     TIMES,
@@ -106,7 +106,7 @@ def measure_against(
     if random:
         tables += [times_table(random), outcomes_table(random)]
         ours, theirs = [row.cpu for row in random], [row.cpu_peer for row in random]
-        show = partial(plots.against, ours=ours, theirs=theirs, name=name)
+        show = partial(against_plot, ours=ours, theirs=theirs, name=name)
         drawn.append(Plot(name=f"against-{name}", draw=show, panels=2))
     if unsolved:
         tables.append(unsolved_table(rows[len(tasks) :]))

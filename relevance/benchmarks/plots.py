@@ -31,7 +31,7 @@ def save(plot: Plot, folder: Path) -> list[Path]:
     return files
 
 
-def speed(left: Axes, right: Axes, *, rows: Sequence[Planned]) -> None:
+def speed_plot(left: Axes, right: Axes, *, rows: Sequence[Planned]) -> None:
     """Distribution of CPU time by outcome; mean CPU time by bound over the number of boxes."""
     for name, color, some in (
         ("solved", BLUE, [row.cpu for row in rows if row.solved]),
@@ -57,7 +57,7 @@ def speed(left: Axes, right: Axes, *, rows: Sequence[Planned]) -> None:
     right.legend(loc="upper left")
 
 
-def truth(ax: Axes, *, rows: Sequence[Planned]) -> None:
+def truth_plot(ax: Axes, *, rows: Sequence[Planned]) -> None:
     """Deepest penetration of each plan, the planner's check against the replay."""
     judged = [row for row in rows if row.replay_max_penetration is not None]
     own = [1e3 * (row.max_penetration or 0.0) for row in judged]
@@ -74,7 +74,7 @@ def truth(ax: Axes, *, rows: Sequence[Planned]) -> None:
     )
 
 
-def scaling(time: Axes, nodes: Axes, solved: Axes, *, rows: Sequence[Planned]) -> None:
+def scaling_plot(time: Axes, nodes: Axes, solved: Axes, *, rows: Sequence[Planned]) -> None:
     """CPU time and nodes (median, 10th to 90th percentile) and share solved over boxes."""
     for search, color in SEARCH_COLOR.items():
         boxes = sorted({row.n_objects for row in rows if row.search == search})
@@ -98,7 +98,7 @@ def scaling(time: Axes, nodes: Axes, solved: Axes, *, rows: Sequence[Planned]) -
     time.legend(loc="upper left")
 
 
-def against(
+def against_plot(
     left: Axes, right: Axes, *, ours: Sequence[float], theirs: Sequence[float], name: str
 ) -> None:
     """CPU time of both planners: distributions, and task by task."""

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from relevance.benchmarks import plots
+from relevance.benchmarks.plots import scaling_plot
 from relevance.benchmarks.runs import (
     DEFAULTS,
     Measured,
@@ -111,7 +111,7 @@ def measure_scaling(
         name="scaling",
         rows=tuple(rows),
         tables=(scaling_table(rows, config),),
-        plots=(Plot(name="scaling", draw=partial(plots.scaling, rows=rows), panels=3),),
+        plots=(Plot(name="scaling", draw=partial(scaling_plot, rows=rows), panels=3),),
     )
 
 

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from relevance.benchmarks import plots
+from relevance.benchmarks.plots import speed_plot, truth_plot
 from relevance.benchmarks.runs import (
     DEFAULTS,
     TIMES,
@@ -83,13 +83,13 @@ def measure_planning(
     drawn: list[Plot] = []
     if speed:
         tables += [speed_table(rows), bounds_table(rows), boxes_table(rows)]
-        drawn.append(Plot(name="speed", draw=partial(plots.speed, rows=rows), panels=2))
+        drawn.append(Plot(name="speed", draw=partial(speed_plot, rows=rows), panels=2))
     if truth:
         tables += [truth_table(rows)]
         refused = [row for row in rows if row.replay_ok is False]
         if refused:
             tables.append(refused_table(refused))
-        drawn.append(Plot(name="truth", draw=partial(plots.truth, rows=rows)))
+        drawn.append(Plot(name="truth", draw=partial(truth_plot, rows=rows)))
     return Measured(name="tasks", rows=tuple(rows), tables=tuple(tables), plots=tuple(drawn))
 
 
