@@ -8,7 +8,8 @@ Everything else is brute force over poses with a separating-axis gap in numpy.
 
 A goal is solvable with a set of boxes gone when they can be taken one after the other and put on
 the table out of everybody's way, and then the subject can be taken and put at the goal in one
-hold. The reference box stays where it is. Motions between the switches are not looked at.
+hold. The reference box stays where it is. Motions between the switches are not looked at, and of
+the arm the hand and the link above it alone: a tall stack may still meet the forearm.
 """
 
 from __future__ import annotations
@@ -163,7 +164,7 @@ _ROUNDS = 60
 def reach_map() -> np.ndarray:
     """(R, Z) bool: where the downward hand can be, by damped least squares from two starts.
 
-    The finger angle needs no look: the last joint alone turns it, by more than half a turn.
+    The finger angle is the last joint's alone, which `_reached` looks at.
     """
     arm = panda()
     lower, upper = arm.lower[:6], arm.upper[:6]
@@ -212,12 +213,19 @@ def _hand_error(q: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return np.concatenate([hand - target, tilt + up], axis=1), jacobian
 
 
-def _reached(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Whether the downward hand can be at these places, and LIFT above them."""
+def _reached(
+    scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, angle: np.ndarray
+) -> np.ndarray:
+    """Whether the downward hand can be at these places, and LIFT above them.
+
+    angle: of the finger axis, rad; the two ways round are two angles.
+    """
     base, found = scene.robot.base, reach_map()
     dx, dy = x - base[0], y - base[1]
-    ahead = (np.arctan2(dy, dx) - scene.robot.yaw + math.pi) % (2 * math.pi) - math.pi
+    ahead = _wrapped(np.arctan2(dy, dx) - scene.robot.yaw)
+    last = _wrapped(ahead - (angle - scene.robot.yaw) - math.pi / 4)
     good = np.abs(ahead) <= panda().upper[0] - 0.05
+    good &= np.abs(last) <= panda().upper[6] - 0.05
     for height in (z - base[2], z - base[2] + LIFT):
         cells = []
         for value, (low, high, count) in zip((np.hypot(dx, dy), height), _GRID, strict=True):
@@ -227,6 +235,11 @@ def _reached(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.nd
         i, j = cells  # all four corners of the cell, so that it is true in between
         good &= found[i, j] & found[i + 1, j] & found[i, j + 1] & found[i + 1, j + 1]
     return good
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    """The same angles within half a turn of 0, rad."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 # -- exhaustion -----------------------------------------------------------------------------------
@@ -419,8 +432,8 @@ class _Exhaustion:
         """Which depths are within reach at the poses of the box, (N, D) bool."""
         hand = _over(poses, hold)
         z = bottom + box.size[2] - hold.depths + panda().finger_tip
-        x, y, z = np.broadcast_arrays(hand[:, :1], hand[:, 1:2], z[None, :])
-        return _reached(self.scene, x, y, z)
+        x, y, angle, z = np.broadcast_arrays(hand[:, :1], hand[:, 1:2], hand[:, 2:], z[None, :])
+        return _reached(self.scene, x, y, z, angle)
 
     def _hit_by_box(self, box: Box, poses: np.ndarray, bottom: float) -> np.ndarray:
         """Who is in the way of a box that comes down there, (N,) sets."""
@@ -483,7 +496,7 @@ def _over(poses: np.ndarray, hold: Hold) -> np.ndarray:
 def _reached_by(scene: Scene, box: Box, poses: np.ndarray, bottom: float, way: _Way) -> np.ndarray:
     hand = _over(poses, way.hold)
     z = bottom + box.size[2] - way.depth + panda().finger_tip
-    return _reached(scene, hand[:, 0], hand[:, 1], np.full(len(hand), z))
+    return _reached(scene, hand[:, 0], hand[:, 1], np.full(len(hand), z), hand[:, 2])
 
 
 def _hand_rows(box: Box, pose: np.ndarray, bottom: float, way: _Way) -> np.ndarray:
