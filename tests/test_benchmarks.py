@@ -1,4 +1,4 @@
-"""The benchmark: its tasks, its reference, its figures, and the command."""
+"""The benchmark: its tasks, its figures, its parts, and the command."""
 
 import csv
 import json
@@ -13,17 +13,18 @@ from relevance.benchmarks import (
     MAX_EDGE,
     BenchmarkError,
     draw,
+    find_unsolved,
+    measure_against,
     measure_completeness,
     measure_planning,
     measure_scaling,
     measure_searches,
     measure_stability,
+    measure_versus,
     save,
 )
-from relevance.benchmarks.against import measure_against
 from relevance.benchmarks.completeness import Compared, completeness_table
-from relevance.benchmarks.reference import CLEARANCE, _gap, shortest
-from relevance.benchmarks.runs import interval, ratio_of_medians, share
+from relevance.benchmarks.runs import Measured, interval, ratio, share
 from relevance.benchmarks.stability import (
     JITTER,
     JITTERS,
@@ -33,9 +34,11 @@ from relevance.benchmarks.stability import (
     jittered,
     stability_table,
 )
+from relevance.benchmarks.versus import ROOT
 from relevance.cli import main
+from relevance.cli.bench import hand_over
 from relevance.planner import Counts, PlannerConfig, PlanResult, Seconds, plan
-from relevance.scene import Box, Scene, footprint_gap, goal_holds, read_scenes
+from relevance.scene import Box, Scene, goal_holds, read_scenes
 
 RED, GREEN, BLUE = (0.8, 0.1, 0.1), (0.1, 0.7, 0.1), (0.1, 0.1, 0.8)
 
@@ -47,6 +50,9 @@ def box(name, x, y, color=RED, size=(0.05, 0.05, 0.06), **rest):
 
 def found(table):
     return {str(row[0]): row[1] for row in table.rows}
+
+
+FREE = (box("red", 0.0, 0.25), box("blue", 0.0, -0.1, BLUE))
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +79,21 @@ def test_thirty_boxes_can_be_drawn():
     drawn = draw(5, 3, boxes=(30, 30), max_edge=MAX_EDGE)
     assert [task.n_objects for task in drawn] == [30] * 5
     assert max(max(b.size[:2]) for task in drawn for b in task.scene.objects) <= MAX_EDGE
+
+
+def test_foreign_tasks_are_three_to_two_and_depend_on_the_seed_alone():
+    drawn = draw(200, 4, scenes="foreign")
+    assert Counter(task.goal.predicate.stacked for task in drawn) == {False: 120, True: 80}
+    beside = Counter(task.goal.predicate.name for task in drawn if not task.goal.predicate.stacked)
+    assert set(beside.values()) == {30}
+    assert draw(3, 4, scenes="foreign", first=5) == drawn[5:8]
+    assert draw(3, 5, scenes="foreign") != drawn[:3]
+    for task in drawn:
+        edges = [edge for b in task.scene.objects for edge in b.size]
+        assert 0.04 <= min(edges) <= max(edges) <= 0.12
+        assert min(task.scene[task.goal.subject].size[:2]) <= 0.07
+        assert not goal_holds(task.scene.objects, task.goal, task.scene.robot)
+    assert any(b.on for task in drawn for b in task.scene.objects)
 
 
 def test_impossible_settings_name_what_is_wrong():
@@ -103,11 +124,12 @@ def test_intervals_cover_and_shrink_with_the_sample():
     assert interval([2.0], "p99").high == 2.0
 
 
-def test_ratio_of_medians_pairs_the_tasks():
+@pytest.mark.parametrize("statistic", ["median", "mean"])
+def test_ratios_pair_the_tasks(statistic):
     times = np.random.default_rng(2).lognormal(size=200)
-    ratio = ratio_of_medians(100 * times, times)
-    assert ratio.value == pytest.approx(100)
-    assert ratio.high - ratio.low < 1e-9  # the same tasks are drawn for both
+    found = ratio(100 * times, times, statistic)
+    assert found.value == pytest.approx(100)
+    assert found.high - found.low < 1e-9  # the same tasks are drawn for both
 
 
 def test_shares_say_how_many_of_how_many():
@@ -115,69 +137,29 @@ def test_shares_say_how_many_of_how_many():
     assert share(0, 0) == "0 of 0"
 
 
-# -- the exhaustive reference ----------------------------------------------------------------------
+# -- completeness ----------------------------------------------------------------------------------
 
 
-def test_gap_equals_the_scenes_own_separating_axis():
-    rng = np.random.default_rng(3)
-    for _ in range(200):
-        a, b = (
-            box(
-                name,
-                *rng.uniform(-0.1, 0.1, 2),
-                size=(*rng.uniform(0.03, 0.12, 2), 0.05),
-                yaw=rng.uniform(-3, 3),
-            )
-            for name in "ab"
-        )
-        axis = np.array([[math.cos(a.yaw), math.sin(a.yaw)]])
-        gap = _gap(np.array([a.position[:2]]), axis, a.size[0] / 2, a.size[1] / 2, b)
-        assert gap[0] == pytest.approx(footprint_gap(a, b), abs=1e-12)
-
-
-FREE = (box("red", 0.0, 0.25), box("blue", 0.0, -0.1, BLUE))
-BLOCKER = box("green", 0.0, 0.0, GREEN, size=(0.11, 0.06, 0.06))
-
-
-def test_reference_counts_the_boxes_that_must_go():
-    scene = Scene(objects=FREE)
-    goal = scene.goal("on-the-left(red, blue)")
-    assert shortest(scene, goal, CLEARANCE) == 0
-    blocked = Scene(objects=(*FREE, BLOCKER))
-    assert shortest(blocked, goal, CLEARANCE) == 1
-    top = box("grey", 0.0, 0.0, (0.5, 0.5, 0.5), bottom=0.06, size=(0.05,) * 3, on="green")
-    assert shortest(Scene(objects=(*blocked.objects, top)), goal, CLEARANCE) == 2
-
-
-def test_reference_knows_what_cannot_be_taken_or_reached():
-    goal = "on-the-left(red, blue)"
-    wide = Scene(objects=(box("red", 0.0, 0.25, size=(0.1, 0.1, 0.06)), FREE[1]))
-    assert shortest(wide, wide.goal(goal), CLEARANCE) is None
-    stuck = replace(BLOCKER, size=(0.11, 0.085, 0.06))  # too wide for the hand
-    scene = Scene(objects=(*FREE, replace(stuck, position=(0.0, 0.0, 0.03))))
-    assert shortest(scene, scene.goal(goal), CLEARANCE) is None
-    far = Scene(objects=(box("red", 0.37, 0.57), FREE[1]))
-    assert shortest(far, far.goal(goal), CLEARANCE) is None
-
-
-def test_more_clearance_never_makes_a_task_easier():
-    for task in draw(20, 5, boxes=(3, 5)):
-        needs = [shortest(task.scene, task.goal, c) for c in (CLEARANCE, 0.01)]
-        assert (needs[0] if needs[0] is not None else 9) <= (
-            needs[1] if needs[1] is not None else 9
-        )
-
-
-def test_completeness_counts_what_is_lost():
+def test_completeness_counts_what_is_refuted_and_what_is_longer():
     row = Compared(
         task=0, scene_id="", goal="", predicate="on", n_objects=3, status="solved", reason="",
-        ambiguous=False, moved=("red",), reference=0, robust=0,
+        ambiguous=False, moved=("red",), reference=0, robust=0, alone=None,
     )  # fmt: skip
-    rows = [row, replace(row, moved=("a", "red")), replace(row, status="infeasible", moved=()),
-            replace(row, reference=None, robust=None)]  # fmt: skip
+    refused = replace(row, status="infeasible", moved=(), alone=True)
+    rows = [
+        row,
+        replace(row, moved=("a", "red")),
+        replace(row, moved=("a", "red"), robust=1),
+        refused,
+        replace(refused, ambiguous=True, robust=None),
+        replace(refused, reference=None, robust=None, alone=False),
+        replace(refused, status="limit"),
+        replace(row, reference=None, robust=None),
+    ]
     lines = completeness_table(rows).rows
     assert [line[1].split(" = ")[0] for line in lines] == [
-        "3 of 4", "1 of 3", "3 of 4", "1 of 3", "1 of 3", "1 of 3", "1 of 2", "1 of 2", "1",
+        "3 of 8", "2 of 3", "1 of 3", "1 of 3", "1 of 3", "1 of 1", "4 of 8", "2 of 4", "1 of 4",
+        "1", "5 of 8", "2 of 5", "1",
     ]  # fmt: skip
 
 
@@ -297,6 +279,51 @@ def test_against_counts_both_and_lets_the_replay_judge(tasks):
     assert lines["solved by other"].startswith("2 of 3")
     assert lines["plans that replay, other"].startswith("1 of 2")
     assert lines["stopped at the limit, other"].startswith("1 of 3")
+    assert not measured.exceptions
+
+
+def test_against_lists_the_tasks_in_which_the_peer_does_better(tasks):
+    """Ours may take too few actions here: the peer solves what ours leaves, in both kinds."""
+    short = PlannerConfig(max_actions=2)
+    hard = find_unsolved(2, 1, config=short)
+    assert [plan(task.scene, task.goal, config=short).status for task in hard] == ["infeasible"] * 2
+    measured = measure_against(tasks[:2], plan, name="other", unsolved=hard, config=short)
+    assert [row.kind for row in measured.rows] == ["random"] * 2 + ["unsolved"] * 2
+    beaten = [row for row in measured.rows if row.status != "solved" and row.replay_ok_peer]
+    assert beaten
+    assert [task.scene.id for task in measured.exceptions] == [row.scene_id for row in beaten]
+    tables = {table.name: table for table in measured.tables}
+    assert len(tables["exceptions"].rows) == len(beaten)
+    assert set(tables) == {"against", "outcomes", "unsolved", "exceptions"}
+    row = measured.rows[0]
+    both = replace(row, status="solved", replay_ok=True, moved=("a", "b", "c"), moved_peer=("c",))
+    assert not replace(both, replay_ok_peer=False).longer
+    assert replace(both, replay_ok_peer=True).longer
+    assert not replace(both, replay_ok_peer=True).lost
+
+
+def test_versus_needs_a_checkout(tasks, tmp_path):
+    with pytest.raises(BenchmarkError, match="expected a checkout"):
+        measure_versus(tasks[:1], tmp_path)
+    broken = tmp_path / "relevance" / "planner"
+    broken.mkdir(parents=True)
+    (broken.parent / "__init__.py").touch()
+    (broken / "__init__.py").touch()
+    with pytest.raises(BenchmarkError, match="its planner stopped"):
+        measure_versus(tasks[:1], tmp_path)
+
+
+@pytest.mark.slow  # two processes start and warm up
+def test_versus_itself_nothing_differs(tasks):
+    measured = measure_versus(tasks[:3], ROOT, growth=tasks[3:4])
+    assert [row.part for row in measured.rows] == ["tasks"] * 3 + ["growth"]
+    for row, task in zip(measured.rows, tasks, strict=False):
+        ours = plan(task.scene, task.goal)
+        assert (row.status, row.moved) == (row.status_other, row.moved_other)
+        assert (row.status, row.moved) == (ours.status, ours.moved)
+        assert row.cpu > 0 < row.cpu_other
+    assert not measured.exceptions
+    assert found(measured.tables[1])["same moved set where both solve"].startswith("3 of 3")
 
 
 def test_completeness_and_stability_cover_every_task(tasks):
@@ -330,6 +357,20 @@ def test_bench_writes_rows_tables_plots_and_scenes_that_plan_reads(tmp_path, cap
     assert "truth" in {table["name"] for table in summary["tables"]}
 
 
+def test_exceptions_are_scenes_that_plan_reads(tasks, tmp_path, capsys):
+    row = Compared(
+        task=0, scene_id="", goal="", predicate="on", n_objects=3, status="solved", reason="",
+        ambiguous=False, moved=(), reference=0, robust=0, alone=None,
+    )  # fmt: skip
+    for some in (tasks[:1], tasks[1:3], []):  # of several parts, one of them without any
+        part = Measured(name="part", rows=(row,), tables=(), exceptions=tuple(some))
+        hand_over(part, tmp_path)
+    scenes = read_scenes(tmp_path / "exceptions.jsonl")
+    assert [(scene.id, scene.goals) for scene in scenes] == [
+        (task.scene.id, (str(task.goal),)) for task in tasks[:3]
+    ]
+
+
 def test_parts_are_chosen_and_a_fresh_seed_is_told(tmp_path, capsys):
     out = str(tmp_path)
     assert main(["bench", "planner", "--tasks", "2", "--out", out, "--parts", "searches"]) == 0
@@ -348,5 +389,25 @@ def test_bench_without_a_known_target_says_which_there_are(capsys):
     assert "bench planner" in capsys.readouterr().out
     assert main(["bench", "nothing"]) == 2
     assert "bench planner" in capsys.readouterr().err
-    assert main(["bench", "planner", "--tasks", "0"]) == 2
-    assert "--tasks 0: expected at least 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--tasks", "0"], "--tasks 0: expected at least 1"),
+        (["--seed", "-1"], "--seed -1: expected 0 to 2**63 - 1"),
+        (["--unsolved", "3"], "--unsolved 3: expected --against as well"),
+        (["--unsolved", "-3"], "--unsolved -3: expected at least 0"),
+        (["--limit", "nan"], "--limit nan: expected a number over 0"),
+        (["--versus", "/nowhere", "--tasks", "1"], "/nowhere: no relevance/planner in it"),
+    ],
+)
+def test_wrong_options_are_one_line(flags, words, tmp_path, capsys):
+    assert main(["bench", "planner", "--out", str(tmp_path / "out"), *flags]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_file_where_the_folder_belongs_is_one_line(tmp_path, capsys):
+    (tmp_path / "taken").touch()
+    assert main(["bench", "planner", "--out", str(tmp_path / "taken")]) == 2
+    assert "taken: File exists, expected a folder" in capsys.readouterr().err

@@ -5,27 +5,38 @@ for a person, and what its plots need. Times are CPU seconds of this process (al
 unless a name says wall; intervals are 95%: bootstrap for times, Wilson for shares.
 """
 
-from relevance.benchmarks.against import measure_against
+from relevance.benchmarks.against import find_unsolved, measure_against
 from relevance.benchmarks.completeness import measure_completeness
 from relevance.benchmarks.plots import save
 from relevance.benchmarks.runs import Measured
-from relevance.benchmarks.searches import MAX_EDGE, SIZES, measure_scaling, measure_searches
+from relevance.benchmarks.searches import (
+    CAPPED,
+    MAX_EDGE,
+    SIZES,
+    measure_scaling,
+    measure_searches,
+)
 from relevance.benchmarks.speed import measure_planning
 from relevance.benchmarks.stability import measure_stability
-from relevance.benchmarks.tasks import BenchmarkError, Task, draw
+from relevance.benchmarks.tasks import BenchmarkError, Scenes, Task, draw
+from relevance.benchmarks.versus import measure_versus
 
 __all__ = [
+    "CAPPED",
     "MAX_EDGE",
     "SIZES",
     "BenchmarkError",
     "Measured",
+    "Scenes",
     "Task",
     "draw",
+    "find_unsolved",
     "measure_against",
     "measure_completeness",
     "measure_planning",
     "measure_scaling",
     "measure_searches",
     "measure_stability",
+    "measure_versus",
     "save",
 ]

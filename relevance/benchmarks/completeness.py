@@ -1,25 +1,23 @@
-"""Completeness on small scenes: the planner against the exhaustive reference."""
+"""What the planner's *no* and its shortest plans are worth: against the exhaustive reference."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from relevance.benchmarks.reference import CLEARANCE, shortest
-from relevance.benchmarks.runs import Measured, Progress, share
-from relevance.benchmarks.speed import DEFAULTS, timed_plan
+from relevance.benchmarks.reference import CLEARANCE, possible, shortest
+from relevance.benchmarks.runs import DEFAULTS, Measured, Progress, share, timed_plan
 from relevance.benchmarks.tasks import Task
 from relevance.planner import PlannerConfig, warm_up
 from relevance.report.tables import Table
 
-BOXES = (3, 5)
 ROBUST = 0.005
 """Clearance with which a task counts as solvable beyond the reference's resolution, m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Compared:
-    """One small task, planned and solved by exhaustion."""
+    """One task, planned and solved by exhaustion."""
 
     task: int
     scene_id: str
@@ -34,6 +32,8 @@ class Compared:
     """Fewest boxes to move before the subject, by the reference; None: it finds nothing."""
     robust: int | None
     """The same with ROBUST clearance."""
+    alone: bool | None
+    """Whether it could be done if no box but subject and reference were there; None: solved."""
 
     @property
     def solved(self) -> bool:
@@ -45,6 +45,16 @@ class Compared:
         """Boxes that the plan moves before the subject."""
         return max(len(self.moved) - 1, 0)
 
+    @property
+    def refuted(self) -> bool:
+        """Whether the planner has no plan where the reference has one, with room to spare."""
+        return not self.solved and self.robust is not None
+
+    @property
+    def longer(self) -> bool:
+        """Whether the plan moves more boxes than the reference needs, with room to spare."""
+        return self.solved and self.robust is not None and self.others > self.robust
+
 
 def measure_completeness(
     tasks: Sequence[Task],
@@ -52,26 +62,34 @@ def measure_completeness(
     config: PlannerConfig = DEFAULTS,
     progress: Progress = lambda done, total: None,
 ) -> Measured:
-    """Plan every task and solve it by exhaustion; tasks should have at most five boxes."""
+    """Plan every task and solve it by exhaustion."""
     warm_up()
     rows = []
     for done, task in enumerate(tasks, 1):
         rows.append(compared(task, config))
         progress(done, len(tasks))
-    tables = [completeness_table(rows)]
-    worth = [row for row in rows if row.robust is not None and not row.solved]
-    worth += [row for row in rows if row.solved and row.robust is not None and longer(row)]
+    tables = [completeness_table(rows, config)]
+    worth = [row for row in rows if row.refuted or row.longer]
     if worth:
         tables.append(_listed(worth))
-    return Measured(name="completeness", rows=tuple(rows), tables=tuple(tables))
+    return Measured(
+        name="completeness",
+        rows=tuple(rows),
+        tables=tuple(tables),
+        exceptions=tuple(
+            task for task, row in zip(tasks, rows, strict=True) if row.refuted or row.longer
+        ),
+    )
 
 
 def compared(task: Task, config: PlannerConfig) -> Compared:
     """Plan one task and solve it by exhaustion, twice."""
     result, _, _ = timed_plan(task, config)
+    most = config.max_actions // 2 - 1
+    others = [n for n in task.scene.names if n not in (task.goal.subject, task.goal.reference)]
     # What is solvable with more clearance is solvable with less.
-    robust = shortest(task.scene, task.goal, ROBUST)
-    reference = robust if robust == 0 else shortest(task.scene, task.goal, CLEARANCE)
+    robust = shortest(task.scene, task.goal, ROBUST, most)
+    reference = robust if robust == 0 else shortest(task.scene, task.goal, CLEARANCE, most)
     return Compared(
         task=task.index,
         scene_id=task.scene.id,
@@ -84,48 +102,56 @@ def compared(task: Task, config: PlannerConfig) -> Compared:
         moved=result.moved,
         reference=reference,
         robust=robust,
+        alone=None if result.status == "solved" else possible(task.scene, task.goal, others),
     )
 
 
-def longer(row: Compared) -> bool:
-    """Whether the plan moves more boxes than the robust reference needs."""
-    return row.robust is not None and row.others > row.robust
-
-
-def completeness_table(rows: Sequence[Compared]) -> Table:
-    """What is lost, what is called infeasible, and whether plans are of minimal length."""
-    solvable = [row for row in rows if row.reference is not None]
+def completeness_table(rows: Sequence[Compared], config: PlannerConfig = DEFAULTS) -> Table:
+    """Which verdicts the reference refutes, and which plans move more boxes than they must."""
+    infeasible = [row for row in rows if row.status == "infeasible"]
+    limit = [row for row in rows if row.status == "limit"]
+    solved = [row for row in rows if row.solved]
     robust = [row for row in rows if row.robust is not None]
-    both = [row for row in solvable if row.solved]
-    lost = [row for row in solvable if not row.solved]
-    firm = [row for row in robust if not row.solved]
-    minimal = sum(row.others <= (row.reference or 0) for row in both)
-    clear = sum(not longer(row) for row in both if row.robust is not None)
-    refused = sum(row.status == "infeasible" for row in firm)
+    firm = [row for row in robust if row.solved]
+    over = [row for row in solved if row.reference is not None and row.others > row.reference]
+    found = sum(row.reference is not None for row in infeasible)
+    lost = [row for row in robust if not row.solved]
+    needless = sum(row.others - (row.robust or 0) for row in firm if row.longer)
     lines = (
-        ("solvable by the reference", share(len(solvable), len(rows))),
-        ("of these lost by the planner", share(len(lost), len(solvable))),
-        ("solvable by the reference with 2 mm to spare", share(len(robust), len(rows))),
-        ("of these lost by the planner", share(len(firm), len(robust))),
-        ("of these called infeasible", share(refused, len(robust))),
-        ("of these lost and not flagged ambiguous", share(_plain(firm), len(robust))),
-        ("plans no longer than the reference's", share(minimal, len(both))),
+        ("called infeasible", share(len(infeasible), len(rows))),
+        ("of these solvable by the reference", share(found, len(infeasible))),
+        ("of these solvable with 2 mm to spare", share(_refuted(infeasible), len(infeasible))),
+        ("of these not flagged ambiguous", share(_plain(infeasible), len(infeasible))),
         (
-            "plans no longer than the reference's with 2 mm to spare",
-            share(clear, sum(row.robust is not None for row in both)),
+            "of these impossible even with all other boxes gone",
+            share(sum(row.alone is False for row in infeasible), len(infeasible)),
         ),
-        ("solved by the planner alone", str(sum(r.solved and r.reference is None for r in rows))),
+        ("stopped at a limit, solvable with 2 mm to spare", share(_refuted(limit), len(limit))),
+        ("solved", share(len(solved), len(rows))),
+        ("of these fewer boxes must move", share(len(over), len(solved))),
+        ("of these fewer with 2 mm to spare", share(sum(r.longer for r in firm), len(solved))),
+        ("boxes moved needlessly, with 2 mm to spare", str(needless)),
+        ("solvable by the reference with 2 mm to spare", share(len(robust), len(rows))),
+        ("of these lost by the planner", share(len(lost), len(robust))),
+        ("solved by the planner alone", str(sum(r.reference is None for r in solved))),
     )
     return Table(
         name="completeness",
-        title="Completeness against exhaustion (up to two boxes moved before the subject)",
+        title=(
+            "Completeness against exhaustion "
+            f"(up to {config.max_actions // 2 - 1} boxes moved before the subject)"
+        ),
         columns=("what", "found"),
         rows=lines,
     )
 
 
+def _refuted(rows: Sequence[Compared]) -> int:
+    return sum(row.refuted for row in rows)
+
+
 def _plain(rows: Sequence[Compared]) -> int:
-    return sum(not row.ambiguous for row in rows)
+    return sum(row.refuted and not row.ambiguous for row in rows)
 
 
 def _listed(rows: Sequence[Compared]) -> Table:

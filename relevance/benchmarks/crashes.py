@@ -185,7 +185,6 @@ def kill_once(
     *,
     number: int,
     longest: float,
-    target: str | None = None,
 ) -> Trial | None:
     """Start the pipeline and kill one of its processes, or all, at a random moment.
 
@@ -201,7 +200,7 @@ def kill_once(
         kinds = sorted(set(alive.values()) & {"pipeline", "worker", "server"})
         if process.poll() is not None or not kinds:
             return None
-        what = target if target in (*kinds, "all") else rng.choice([*kinds, "all"])
+        what = rng.choice([*kinds, "all"])
         shards = len(hashes(pipeline.root))
         if what == "all":
             kill_all(process.pid)

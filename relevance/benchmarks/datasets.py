@@ -36,6 +36,10 @@ TWO_OVER_ONE = 1.85
 """Wanted of two processes over one."""
 READING_SHARE = 0.9
 """Wanted of the reader over decoding alone."""
+PROCESSES = 2
+"""How many are measured against one."""
+READING_ROUNDS, QUERY_ROUNDS = 15, 3
+"""How often each is timed; the best counts."""
 QUERY_SECONDS = 1.0
 """Wanted of the label balance of 50 million rows."""
 
@@ -62,7 +66,7 @@ class Rate:
 
 
 def measure_making(
-    folder: Path, *, scenes: int, seed: int, workers: int = 2, progress: Progress | None = None
+    folder: Path, *, scenes: int, seed: int, progress: Progress | None = None
 ) -> Measured:
     """Scenes and labelled goals a second of one core, and of several processes over one.
 
@@ -72,16 +76,16 @@ def measure_making(
     """
     nothing = {"validation": Counts(), "test": Counts()}
     preset = replace(DatasetConfig.laptop(), seed=seed, **nothing)
-    whole = workers * preset.scenes_per_shard  # shards as the preset has them: each starts anew
+    whole = PROCESSES * preset.scenes_per_shard  # shards as the preset has them: each starts anew
     drawn = replace(preset, train=Counts(same_plane=whole, on=whole))
     planned = replace(
         preset,
         train=Counts(same_plane=scenes, on=scenes),
-        scenes_per_shard=max(1, scenes // (8 * workers)),  # short, so that all end at once
+        scenes_per_shard=max(1, scenes // (8 * PROCESSES)),  # short, so that all end at once
     )
     rates: list[Rate] = []
     stages: dict[str, tuple[Callable[[Any], tuple[int, float]], list[Any]]] = {}
-    for processes in dict.fromkeys((1, workers)):
+    for processes in (1, PROCESSES):
         roots = [folder / f"{what}-by-{processes}" for what in ("drawn", "planned")]
         with _pool(processes, folder / f"warm-{processes}", planned) as pool:
             first, second = (
@@ -115,24 +119,23 @@ def measure_making(
                         seconds_cpu=cpu,
                     )
                 )
-    if workers > 1:
-        half = len(rates) // 2
-        for stage, one, several in zip(stages, rates[:half], rates[half:], strict=True):
-            rates.append(
-                Rate(
-                    what=f"{stage}, {workers} processes over 1",
-                    value=one.seconds / several.seconds,
-                    unit="times",
-                    wanted=TWO_OVER_ONE if workers == 2 and stage != "sums" else None,
-                    count=one.count,
-                    seconds=one.seconds + several.seconds,
-                    seconds_cpu=None,
-                )
+    half = len(rates) // 2
+    for stage, one, several in zip(stages, rates[:half], rates[half:], strict=True):
+        rates.append(
+            Rate(
+                what=f"{stage}, {PROCESSES} processes over 1",
+                value=one.seconds / several.seconds,
+                unit="times",
+                wanted=TWO_OVER_ONE if stage != "sums" else None,
+                count=one.count,
+                seconds=one.seconds + several.seconds,
+                seconds_cpu=None,
             )
+        )
     return _measured("making", "Making", rates)
 
 
-def measure_reading(folder: Path, *, seed: int, rounds: int = 15) -> Measured:
+def measure_reading(folder: Path, *, seed: int) -> Measured:
     """The trainers' reader against decoding alone, scenes a processor second, one process.
 
     Reads one shard of the laptop preset, made for the purpose.
@@ -153,7 +156,7 @@ def measure_reading(folder: Path, *, seed: int, rounds: int = 15) -> Measured:
         for item in undecoded(dataset.read_images(split, shard), f"shard {shard}")
     ]
     alone, reader = [], []
-    for _ in range(rounds):
+    for _ in range(READING_ROUNDS):
         start = time.process_time()
         for item in items:
             decode(item)
@@ -180,7 +183,7 @@ def measure_reading(folder: Path, *, seed: int, rounds: int = 15) -> Measured:
 
 
 def measure_queries(
-    folder: Path, *, rows: int, shards: int, rounds: int = 3, progress: Progress | None = None
+    folder: Path, *, rows: int, shards: int, progress: Progress | None = None
 ) -> Measured:
     """The label balance over synthetic rows, from small shards and from gathered files.
 
@@ -193,7 +196,7 @@ def measure_queries(
 
     def ask() -> tuple[float, Any]:
         found, seconds = None, []
-        for _ in range(rounds):
+        for _ in range(QUERY_ROUNDS):
             start = time.perf_counter()
             found = sql(root, "from label_balance")
             seconds.append(time.perf_counter() - start)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 import numpy as np
@@ -12,11 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from relevance.benchmarks.runs import Planned, Plot
 from relevance.report.plots import MUTED, STYLE
-
-if TYPE_CHECKING:
-    from relevance.benchmarks.runs import Plot
-    from relevance.benchmarks.speed import Planned
 
 BLUE, ORANGE, GREEN, GREY = "#2f6db3", "#c26a1c", "#3a8a5f", "#8a939d"
 BOUND_COLOR = {"pose": GREEN, "keyframe": ORANGE, "path": BLUE, "rest": GREY}
@@ -35,7 +31,7 @@ def save(plot: Plot, folder: Path) -> list[Path]:
     return files
 
 
-def speed(left: Axes, right: Axes, *, rows: Sequence[Planned]) -> None:
+def speed_plot(left: Axes, right: Axes, *, rows: Sequence[Planned]) -> None:
     """Distribution of CPU time by outcome; mean CPU time by bound over the number of boxes."""
     for name, color, some in (
         ("solved", BLUE, [row.cpu for row in rows if row.solved]),
@@ -61,7 +57,7 @@ def speed(left: Axes, right: Axes, *, rows: Sequence[Planned]) -> None:
     right.legend(loc="upper left")
 
 
-def truth(ax: Axes, *, rows: Sequence[Planned]) -> None:
+def truth_plot(ax: Axes, *, rows: Sequence[Planned]) -> None:
     """Deepest penetration of each plan, the planner's check against the replay."""
     judged = [row for row in rows if row.replay_max_penetration is not None]
     own = [1e3 * (row.max_penetration or 0.0) for row in judged]
@@ -78,7 +74,7 @@ def truth(ax: Axes, *, rows: Sequence[Planned]) -> None:
     )
 
 
-def scaling(time: Axes, nodes: Axes, solved: Axes, *, rows: Sequence[Planned]) -> None:
+def scaling_plot(time: Axes, nodes: Axes, solved: Axes, *, rows: Sequence[Planned]) -> None:
     """CPU time and nodes (median, 10th to 90th percentile) and share solved over boxes."""
     for search, color in SEARCH_COLOR.items():
         boxes = sorted({row.n_objects for row in rows if row.search == search})
@@ -102,11 +98,13 @@ def scaling(time: Axes, nodes: Axes, solved: Axes, *, rows: Sequence[Planned]) -
     time.legend(loc="upper left")
 
 
-def against(left: Axes, right: Axes, *, ours: Sequence[float], theirs: Sequence[float]) -> None:
+def against_plot(
+    left: Axes, right: Axes, *, ours: Sequence[float], theirs: Sequence[float], name: str
+) -> None:
     """CPU time of both planners: distributions, and task by task."""
-    for name, times, color in (("ours", ours, BLUE), ("rai", theirs, ORANGE)):
-        left.ecdf(np.array(times), label=name, color=color)
+    for label, times, color in (("ours", ours, BLUE), (name, theirs, ORANGE)):
+        left.ecdf(np.array(times), label=label, color=color)
     left.set(xscale="log", xlabel="CPU time a task, s", ylabel="share of tasks at most")
     left.legend(loc="lower right")
     right.scatter(ours, theirs, s=12, color=BLUE, linewidths=0)
-    right.set(xscale="log", yscale="log", xlabel="ours, s", ylabel="rai, s")
+    right.set(xscale="log", yscale="log", xlabel="ours, s", ylabel=f"{name}, s")

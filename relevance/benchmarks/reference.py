@@ -1,107 +1,474 @@
-"""An exhaustive reference for small scenes: every set of up to two moved boxes, on a dense grid.
+"""An exhaustive reference: every sound hold of a box, every place on a dense grid, any blockers.
 
-It shares only the arm's reach and the gripper's rectangles with the planner; everything else is
-brute force over positions and angles, with a separating-axis gap in numpy. A goal is solvable
-with a set of boxes gone when each of them can be taken and put on the table in some order, and
-then the subject can be taken and stand in the goal region, gripper included. Motions are not
-looked at, and the reference box stays where it is.
+It is a referee of the planner's *no*, so it shares none of its assumptions: of the planner it
+takes the URDF's numbers alone. The hand points down and takes a box across either edge that fits,
+either way round, with any offset along the box and depth of the finger tips (on a grid) that
+leaves enough of the pads on the faces (`HELD`). Reach comes from its own inverse kinematics.
+Everything else is brute force over poses with a separating-axis gap in numpy.
+
+A goal is solvable with a set of boxes gone when they can be taken one after the other and put on
+the table out of everybody's way, and then the subject can be taken and put at the goal in one
+hold. The reference box stays where it is. Motions between the switches are not looked at, and of
+the arm the hand and the link above it alone: a tall stack may still meet the forearm.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
 
 import numpy as np
 
-from relevance.planner.grasps import Grasp, grasps
-from relevance.planner.kernels.kinematics import reach_interval
-from relevance.planner.pose import LIFT
+from relevance.robot import panda
 from relevance.scene import Box, Goal, Scene
 
 CLEARANCE = 0.003
-"""What the planner keeps clear as well, m."""
+"""What a placed box and the hand (its meshes in boxes, 1 mm wider) keep from everything, m."""
+WIDEST = 0.07
+"""Widest edge that the hand takes (DESIGN section 2), m."""
+SPREAD = 0.003
+"""How far each finger stands off the box before it closes, m."""
+OFFSET = 0.005
+"""Step of the hand's offset along the box, m."""
+DEPTH = 0.004
+"""Step of the depth of the finger tips below the box's top, m."""
+PAD = 0.02
+"""Width of a finger's pad along the box, m."""
+HELD = (0.015, 0.006)
+"""A hold is sound when this much of the pad's width and height lies on the face, m."""
+CLEAR_BELOW = 0.002
+"""How far the finger tips stay above the box's underside, and the palm above its top, m."""
+LIFT = 0.05
+"""Height by which a box must be liftable within reach, m."""
 CELLS = 13
 """Positions along each side of a goal region."""
 ANGLES = 24
-"""Yaws over half a turn."""
+"""Yaws of a box over half a turn."""
 STEP = 0.06
 """Distance of the positions that blockers may be put at, m."""
 MOST = 2
 """Most boxes that are moved besides the subject."""
+VARIANTS = 4
+"""How many holds of the blockers are tried to put them out of the way."""
+TOUCH = 0.002
+"""What stands at most this much lower than a face counts as standing on it, m."""
 
 
-def shortest(scene: Scene, goal: Goal, clearance: float) -> int | None:
-    """Fewest boxes to move before the subject, by exhaustion; None when MOST do not suffice.
+def shortest(scene: Scene, goal: Goal, clearance: float, most: int = MOST) -> int | None:
+    """Fewest boxes to move before the subject, by exhaustion; None when `most` do not suffice."""
+    gone = blocking(scene, goal, clearance, most)
+    return None if gone is None else len(gone)
 
-    clearance: what a placed box and the gripper keep from everything, m. What it exceeds
-    CLEARANCE by, the subject also stays inside its goal region: with more of it fewer tasks are
-    solvable, namely those that do not hang on a millimetre.
+
+def blocking(
+    scene: Scene, goal: Goal, clearance: float, most: int = MOST
+) -> tuple[str, ...] | None:
+    """A smallest set of boxes to move before the subject, in order; None when there is none.
+
+    What `clearance` (m) exceeds CLEARANCE by, the subject also stays inside its goal region: with
+    more of it fewer tasks are solvable, namely those that do not hang on a millimetre.
     """
-    others = [box.name for box in scene.objects if box.name not in (goal.subject, goal.reference)]
-    for count in range(min(MOST, len(others)) + 1):
-        for gone in itertools.combinations(others, count):
-            away = {*gone, goal.subject}
-            standing = [box for box in scene.objects if box.name not in away]
-            if (
-                any(_leave(scene, (*order, goal.subject)) for order in itertools.permutations(gone))
-                and _stands(scene, goal, standing, clearance)
-                # Any free place does for the blockers: scenes this small have room for each.
-                and all(
-                    _has_room(scene, scene[name], [*standing, scene[goal.subject]], clearance)
-                    for name in gone
+    return _Exhaustion(scene, goal, clearance).smallest(most)
+
+
+def possible(scene: Scene, goal: Goal, gone: Sequence[str], clearance: float = CLEARANCE) -> bool:
+    """Whether the subject could be taken and put at the goal if these boxes were not there."""
+    found = _Exhaustion(scene, goal, clearance)
+    return any(need <= set(gone) for need in found.needs())
+
+
+# -- holds ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Hold:
+    """The hand pointing down over a box: a direction, an offset, and the depths that are sound."""
+
+    turn: float
+    """Angle of the finger axis against the box's x, rad."""
+    offset: tuple[float, float]
+    """Of the hand over the box's centre, in the box's axes, m."""
+    depths: np.ndarray
+    """(D,): of the finger tips below the box's top, shallow to deep, m."""
+    parts: np.ndarray
+    """(P, 5): centre along the finger axis and across it, half extents likewise, height of the
+    underside over the finger tips; m."""
+
+
+def holds(box: Box) -> tuple[Hold, ...]:
+    """Every sound hold of a box on the grid, the most centred first."""
+    arm, found = panda(), []
+    height = box.size[2]
+    deepest = min(height, arm.finger_tip - arm.palm) - CLEAR_BELOW
+    depths = np.arange(min(HELD[1], height / 2), deepest + 1e-9, DEPTH)
+    for axis in (0, 1):
+        if box.size[axis] > WIDEST:
+            continue
+        face = box.size[1 - axis]
+        furthest = (face + PAD) / 2 - min(HELD[0], face)
+        steps = math.floor(furthest / OFFSET + 1e-9)
+        parts = _hand(box.size[axis] / 2 + SPREAD)
+        for step, way in itertools.product(range(-steps, steps + 1), (0.0, math.pi)):
+            along = step * OFFSET
+            found.append(
+                Hold(
+                    turn=axis * math.pi / 2 + way,
+                    offset=(0.0, along) if axis == 0 else (along, 0.0),
+                    depths=depths,
+                    parts=parts,
                 )
-            ):
-                return count
-    return None
+            )
+    return tuple(sorted(found, key=lambda hold: max(map(abs, hold.offset))))
 
 
-def _leave(scene: Scene, order: Sequence[str]) -> bool:
-    """Whether these boxes can be taken one after the other."""
-    standing = list(scene.objects)
-    for name in order:
-        box = scene[name]
-        standing.remove(box)
-        if any(name in other.supports for other in standing) or not _takes(scene, box, standing):
-            return False
-    return True
+def _hand(opening: float) -> np.ndarray:
+    """The rectangles of the downward hand with its fingers that far apart, as `Hold.parts`."""
+    arm = panda()
+    corners = [(centre - half, centre + half) for link, centre, half in arm.arm if link == 2]
+    rows = [
+        (
+            (low[1] + high[1]) / 2,
+            (low[0] + high[0]) / 2,
+            (high[1] - low[1]) / 2,
+            (high[0] - low[0]) / 2,
+            arm.finger_tip - high[2],
+        )
+        for low, high in corners
+    ]
+    for low, high in arm.finger:
+        for side in (1.0, -1.0):  # the right finger is the left one turned by half a turn
+            y, x = (low[1] + high[1]) / 2 + opening, (low[0] + high[0]) / 2
+            half = (high[1] - low[1]) / 2, (high[0] - low[0]) / 2
+            rows.append((side * y, side * x, *half, arm.finger_tip - high[2]))
+    return np.array(rows)
 
 
-def _takes(scene: Scene, box: Box, standing: Sequence[Box]) -> bool:
-    """Whether some grasp takes the box where it stands."""
-    at = np.array([[*box.position[:2], box.yaw]])
-    return any(
-        _reachable(scene, at, box, box.bottom, grasp).any()
-        and (_gaps(at, grasp, box.bottom, standing, hand_only=True) >= CLEARANCE).any()
-        for grasp in grasps(box)
-    )
+# -- reach ----------------------------------------------------------------------------------------
+
+# The Panda as its maker publishes it (Denavit and Hartenberg, modified): a, d, alpha.
+_LINKS = (
+    (0.0, 0.333, 0.0), (0.0, 0.0, -math.pi / 2), (0.0, 0.316, math.pi / 2),
+    (0.0825, 0.0, math.pi / 2), (-0.0825, 0.384, -math.pi / 2), (0.0, 0.0, math.pi / 2),
+    (0.088, 0.107, math.pi / 2),
+)  # fmt: skip
+_GRID = ((0.10, 0.90, 81), (-0.30, 0.90, 61))
+"""Distances from the base's axis and heights over the base that are solved for, m."""
+_STARTS = ((0.0, -0.8, 0.0, -2.3, 0.0, 1.6), (0.0, 0.6, 0.0, -1.8, 0.0, 2.4))
+_ROUNDS = 60
 
 
-def _stands(scene: Scene, goal: Goal, standing: Sequence[Box], clearance: float) -> bool:
-    subject, reference = scene[goal.subject], scene[goal.reference]
-    bottom = reference.top if goal.predicate.stacked else 0.0
-    poses = _poses(_region(scene, goal, clearance - CLEARANCE))
-    return _free(scene, subject, poses, bottom, standing, clearance)
+@cache
+def reach_map() -> np.ndarray:
+    """(R, Z) bool: where the downward hand can be, by damped least squares from two starts.
+
+    The finger angle is the last joint's alone, which `_reached` looks at.
+    """
+    arm = panda()
+    lower, upper = arm.lower[:6], arm.upper[:6]
+    r, z = np.meshgrid(*(np.linspace(*ends) for ends in _GRID), indexing="ij")
+    target = np.stack([r.ravel(), np.zeros(r.size), z.ravel()], axis=1)
+    reached = np.zeros(r.size, dtype=bool)
+    for start in _STARTS:
+        q = np.tile(start, (r.size, 1))
+        for _ in range(_ROUNDS):
+            error, jacobian = _hand_error(q, target)
+            square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-5 * np.eye(5)
+            step = jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, error[..., None])
+            q = np.clip(q - np.clip(step[..., 0], -0.4, 0.4), lower, upper)
+        reached |= np.abs(_hand_error(q, target)[0]).max(axis=1) < 1e-4
+    return reached.reshape(r.shape)
 
 
-def _has_room(scene: Scene, box: Box, standing: Sequence[Box], clearance: float) -> bool:
-    half = np.array(scene.table.size) / 2
-    axes = [np.arange(-h, h + STEP, STEP) for h in half]
-    points = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    others = [other for other in standing if other.name != box.name]
-    return _free(scene, box, _poses(points), 0.0, others, clearance)
+def _hand_error(q: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far the hands (N, 6) are off the targets and off pointing down (N, 5), and d/dq."""
+    T = np.tile(np.eye(4), (len(q), 1, 1))
+    axes, origins = [], []
+    for i, (a, d, alpha) in enumerate(_LINKS):
+        c, s = (np.cos(q[:, i]), np.sin(q[:, i])) if i < 6 else (np.ones(len(q)), np.zeros(len(q)))
+        ca, sa = math.cos(alpha), math.sin(alpha)
+        zero, one = np.zeros(len(q)), np.ones(len(q))
+        step = np.array(
+            [
+                [c, -s, zero, a * one],
+                [s * ca, c * ca, -sa * one, -d * sa * one],
+                [s * sa, c * sa, ca * one, d * ca * one],
+                [zero, zero, zero, one],
+            ]
+        ).transpose(2, 0, 1)
+        T = T @ step
+        axes.append(T[:, :3, 2])
+        origins.append(T[:, :3, 3])
+    down, hand = axes[-1], origins[-1]
+    # Twice the distance of `down` from straight down: its x and y vanish when it points up too.
+    tilt = down[:, :2] * (2.0 + down[:, 2:])
+    jacobian = np.empty((len(q), 5, 6))
+    for i in range(6):
+        jacobian[:, :3, i] = np.cross(axes[i], hand - origins[i])
+        turned = np.cross(axes[i], down)
+        jacobian[:, 3:, i] = turned[:, :2] * (2.0 + down[:, 2:]) + down[:, :2] * turned[:, 2:]
+    up = np.where(down[:, 2:] > 0, 1.0, 0.0)
+    return np.concatenate([hand - target, tilt + up], axis=1), jacobian
 
 
-def _region(scene: Scene, goal: Goal, inset: float) -> np.ndarray:
-    """Grid points (N, 2) of the goal region for the subject's centre, from border to border."""
-    steps = np.linspace(-1, 1, CELLS)
-    there = goal.predicate.region(scene[goal.subject], scene[goal.reference], scene.robot)
-    half = [max(extent - inset, 0.0) for extent in there.half]
-    a, b = np.meshgrid(steps * half[0], steps * half[1])
-    c, s = math.cos(there.angle), math.sin(there.angle)
-    local = np.stack([c * a - s * b, s * a + c * b], axis=-1)
-    return local.reshape(-1, 2) + np.array([there.x, there.y])
+def _reached(
+    scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, angle: np.ndarray
+) -> np.ndarray:
+    """Whether the downward hand can be at these places, and LIFT above them.
+
+    angle: of the finger axis, rad; the two ways round are two angles.
+    """
+    base, found = scene.robot.base, reach_map()
+    dx, dy = x - base[0], y - base[1]
+    ahead = _wrapped(np.arctan2(dy, dx) - scene.robot.yaw)
+    last = _wrapped(ahead - (angle - scene.robot.yaw) - math.pi / 4)
+    good = np.abs(ahead) <= panda().upper[0] - 0.05
+    good &= np.abs(last) <= panda().upper[6] - 0.05
+    for height in (z - base[2], z - base[2] + LIFT):
+        cells = []
+        for value, (low, high, count) in zip((np.hypot(dx, dy), height), _GRID, strict=True):
+            cell = (value - low) / (high - low) * (count - 1)
+            good &= (cell >= 0) & (cell < count - 1)
+            cells.append(np.clip(np.floor(cell).astype(int), 0, count - 2))
+        i, j = cells  # all four corners of the cell, so that it is true in between
+        good &= found[i, j] & found[i + 1, j] & found[i, j + 1] & found[i + 1, j + 1]
+    return good
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    """The same angles within half a turn of 0, rad."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+# -- exhaustion -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Way:
+    """One way to take a box and put it somewhere."""
+
+    hold: Hold
+    depth: float
+    pose: np.ndarray
+    """(3,) x, y, yaw of the box where it is put, or where it stands."""
+
+
+class _Exhaustion:
+    """One task; sets of boxes are bits of a number, `names` says whose."""
+
+    def __init__(self, scene: Scene, goal: Goal, clearance: float) -> None:
+        self.scene, self.goal, self.clearance = scene, goal, clearance
+        self.names = scene.names
+        self.bit = {name: 1 << i for i, name in enumerate(self.names)}
+        self.never = 1 << len(self.names)  # the robot's foot
+        self.start = {box.name: _row(box) for box in scene.objects}
+        self.rows = np.array([*self.start.values(), _foot(scene)])
+        self.above = {
+            name: sum(self.bit[box.name] for box in scene.objects if name in box.supports)
+            for name in self.names
+        }
+        self._taken: dict[str, list[tuple[int, _Way]]] = {}
+
+    def needs(self) -> list[set[str]]:
+        """Sets of boxes (the reference among them never) that suffice to be gone, unordered."""
+        return [{name for name in self.names if self.bit[name] & mask} for mask in self._ways]
+
+    def smallest(self, most: int) -> tuple[str, ...] | None:
+        """See `blocking`."""
+        goal = self.goal
+        others = [name for name in self.names if name not in (goal.subject, goal.reference)]
+        ways = sorted(self._ways.items(), key=lambda item: item[0].bit_count())
+        for count in range(min(most, len(others)) + 1):
+            for chosen in itertools.combinations(others, count):
+                gone = sum(self.bit[name] for name in chosen)
+                fitting = [way for need, way in ways if not need & ~gone]
+                if not fitting:
+                    continue
+                for order in self._orders(chosen):
+                    if any(self._put_aside(order, way) for way in fitting):
+                        return order
+        return None
+
+    @cached_property
+    def _ways(self) -> dict[int, _Way]:
+        """By who has to be gone: how the subject is taken and put at the goal then."""
+        scene, goal = self.scene, self.goal
+        subject, reference = scene[goal.subject], scene[goal.reference]
+        fixed = self.never | self.bit[goal.reference]
+        bottom = reference.top if goal.predicate.stacked else 0.0
+        poses = _poses(self._region())
+        poses = poses[_on_table(scene, subject, poses)]
+        boxes = self._hit_by_box(subject, poses, bottom) & ~self.bit[goal.subject]
+        poses, boxes = poses[boxes & fixed == 0], boxes[boxes & fixed == 0]
+        here = self.start[goal.subject][None, :3]
+        always = self.above[goal.subject] | self._overhanging(subject)
+        found: dict[int, _Way] = {}
+        if len(poses) == 0 or always & fixed:
+            return found
+        for hold in holds(subject):
+            can = self._reaches(subject, here, subject.bottom, hold)
+            can = can & self._reaches(subject, poses, bottom, hold)
+            # The hand of a deeper hold hits whatever that of a shallower one does: the shallowest
+            # that is within reach says it all.
+            first = np.where(can.any(axis=1), can.argmax(axis=1), -1)
+            for i in np.unique(first[first >= 0]).tolist():
+                depth = float(hold.depths[i])
+                taken = self._hit_by_hand(subject, here, subject.bottom, hold, depth)[0]
+                taken = int(taken) & ~self.bit[goal.subject] | always
+                if taken & fixed:
+                    continue
+                at = np.flatnonzero(first == i)
+                put = self._hit_by_hand(subject, poses[at], bottom, hold, depth) | boxes[at]
+                put &= ~self.bit[goal.subject]
+                for need, where in zip(*np.unique(put, return_index=True), strict=True):
+                    if not int(need) & fixed:
+                        way = _Way(hold=hold, depth=depth, pose=poses[at[where]])
+                        found.setdefault(int(need) | taken, way)
+            if 0 in found:
+                return {0: found[0]}
+        return found
+
+    def _region(self) -> np.ndarray:
+        """Grid points (N, 2) of the goal region for the subject's centre, from border to border."""
+        scene, goal = self.scene, self.goal
+        steps = np.linspace(-1, 1, CELLS)
+        there = goal.predicate.region(scene[goal.subject], scene[goal.reference], scene.robot)
+        half = [max(extent - max(self.clearance - CLEARANCE, 0.0), 0.0) for extent in there.half]
+        a, b = np.meshgrid(steps * half[0], steps * half[1])
+        c, s = math.cos(there.angle), math.sin(there.angle)
+        local = np.stack([c * a - s * b, s * a + c * b], axis=-1)
+        return local.reshape(-1, 2) + np.array([there.x, there.y])
+
+    def _orders(self, chosen: Sequence[str]) -> Iterator[tuple[str, ...]]:
+        """Orders in which these boxes can be taken one after the other."""
+        for order in itertools.permutations(chosen):
+            gone = 0
+            for name in order:
+                if not any(not mask & ~gone for mask, _ in self._takes(name)):
+                    break
+                gone |= self.bit[name]
+            else:
+                yield order
+
+    def _takes(self, name: str) -> list[tuple[int, _Way]]:
+        """Who has to be gone before a blocker can be taken, and how it is taken then."""
+        if name not in self._taken:
+            box, here = self.scene[name], self.start[name][None, :3]
+            always = self.above[name] | self._overhanging(box)
+            found: dict[int, list[_Way]] = {}
+            for hold in holds(box):
+                can = self._reaches(box, here, box.bottom, hold)[0]
+                if not can.any():
+                    continue
+                depth = float(hold.depths[can.argmax()])
+                mask = int(self._hit_by_hand(box, here, box.bottom, hold, depth)[0])
+                mask = mask & ~self.bit[name] | always
+                found.setdefault(mask, []).append(_Way(hold=hold, depth=depth, pose=here[0]))
+            self._taken[name] = [
+                (mask, way) for mask, ways in found.items() for way in ways[:VARIANTS]
+            ]
+        return self._taken[name]
+
+    def _put_aside(self, order: Sequence[str], last: _Way) -> bool:
+        """Whether the boxes can be put on the table, clear of all that is still to be done."""
+        return not order or any(self._puts(order, last, k) for k in range(VARIANTS))
+
+    def _puts(self, order: Sequence[str], last: _Way, variant: int) -> bool:
+        scene, goal = self.scene, self.goal
+        subject = scene[goal.subject]
+        bottom = scene[goal.reference].top if goal.predicate.stacked else 0.0
+        ways, gone = [], 0
+        for name in order:
+            fitting = [way for mask, way in self._takes(name) if not mask & ~gone]
+            ways.append(fitting[variant % len(fitting)])
+            gone |= self.bit[name]
+        # Where the hand and the subject come through later: nothing may be put there.
+        here = self.start[goal.subject][:3]
+        ends = [_hand_rows(subject, here, subject.bottom, last)]
+        ends += [_hand_rows(subject, last.pose, bottom, last)]
+        a, b = subject.size[0] / 2, subject.size[1] / 2
+        ends += [np.array([[*last.pose, a, b, bottom, bottom + subject.size[2]]])]
+        picks = [
+            _hand_rows(scene[name], way.pose, scene[name].bottom, way)
+            for name, way in zip(order, ways, strict=True)
+        ]
+        standing = {**self.start, "": _foot(scene)}
+        for i, (name, way) in enumerate(zip(order, ways, strict=True)):
+            del standing[name]
+            box, solid = scene[name], np.array(list(standing.values()))
+            poses = _poses(self._places())
+            poses = poses[_on_table(scene, box, poses)]
+            poses = poses[_reached_by(scene, box, poses, 0.0, way)]
+            later = np.vstack([*ends, *picks[i + 1 :]])
+            later = later[later[:, 5] < box.size[2] + self.clearance]
+            there = _hits(poses, _lying(box), np.array([0.0]), [solid, later], self.clearance)
+            poses = poses[~there.any(axis=1)]
+            tips = box.size[2] - way.depth
+            hand = _over(poses, way.hold)
+            there = _hits(
+                hand, way.hold.parts, tips + way.hold.parts[:, 4], [solid], self.clearance
+            )
+            poses = poses[~there.any(axis=1)]
+            if len(poses) == 0:
+                return False
+            standing[name] = np.array([*poses[0], *self.start[name][3:5], 0.0, box.size[2]])
+        return True
+
+    def _places(self) -> np.ndarray:
+        half = np.array(self.scene.table.size) / 2
+        axes = [np.arange(-h + STEP / 2, h, STEP) for h in half]
+        return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+
+    def _overhanging(self, box: Box) -> int:
+        """Who hangs over a box, so that it cannot be lifted."""
+        here = self.start[box.name][None, :3]
+        over = _hits(here, _lying(box), np.array([box.top]), [self.rows], 0.0)[0]
+        over &= self.rows[:, 5] >= box.top - TOUCH
+        return self._mask(over[None])[0]
+
+    def _reaches(self, box: Box, poses: np.ndarray, bottom: float, hold: Hold) -> np.ndarray:
+        """Which depths are within reach at the poses of the box, (N, D) bool."""
+        hand = _over(poses, hold)
+        z = bottom + box.size[2] - hold.depths + panda().finger_tip
+        x, y, angle, z = np.broadcast_arrays(hand[:, :1], hand[:, 1:2], hand[:, 2:], z[None, :])
+        return _reached(self.scene, x, y, z, angle)
+
+    def _hit_by_box(self, box: Box, poses: np.ndarray, bottom: float) -> np.ndarray:
+        """Who is in the way of a box that comes down there, (N,) sets."""
+        low = np.array([bottom])
+        return self._mask(_hits(poses, _lying(box), low, [self.rows], self.clearance))
+
+    def _hit_by_hand(
+        self, box: Box, poses: np.ndarray, bottom: float, hold: Hold, depth: float
+    ) -> np.ndarray:
+        """Who is in the way of the hand at the poses of the box, (N,) sets; perhaps the box."""
+        low = bottom + box.size[2] - depth + hold.parts[:, 4]
+        return self._mask(_hits(_over(poses, hold), hold.parts, low, [self.rows], self.clearance))
+
+    def _mask(self, hits: np.ndarray) -> np.ndarray:
+        return hits @ (1 << np.arange(hits.shape[1], dtype=np.int64))
+
+
+def _row(box: Box) -> np.ndarray:
+    """x, y, yaw, half extents, underside, top (7,)."""
+    x, y, _ = box.position
+    return np.array([x, y, box.yaw, box.size[0] / 2, box.size[1] / 2, box.bottom, box.top])
+
+
+def _foot(scene: Scene) -> np.ndarray:
+    """The part of the robot that never moves, as a box's row."""
+    (x, y, z), (a, b, h) = panda().foot
+    base, yaw = scene.robot.base, scene.robot.yaw
+    c, s = math.cos(yaw), math.sin(yaw)
+    at = base[0] + c * x - s * y, base[1] + s * x + c * y
+    return np.array([*at, yaw, a, b, base[2] + z - h, base[2] + z + h])
+
+
+def _lying(box: Box) -> np.ndarray:
+    """A box as one part of a hand over its own centre, (1, 5)."""
+    return np.array([[0.0, 0.0, box.size[0] / 2, box.size[1] / 2, 0.0]])
 
 
 def _poses(points: np.ndarray) -> np.ndarray:
@@ -110,80 +477,89 @@ def _poses(points: np.ndarray) -> np.ndarray:
     return np.column_stack([np.repeat(points, ANGLES, axis=0), np.tile(yaws, len(points))])
 
 
-def _free(
-    scene: Scene,
-    box: Box,
-    poses: np.ndarray,
-    bottom: float,
-    standing: Sequence[Box],
-    clearance: float,
-) -> bool:
-    """Whether the box, in some grasp, fits in one of the poses (N, 3), x, y, yaw."""
+def _on_table(scene: Scene, box: Box, poses: np.ndarray) -> np.ndarray:
     c, s = np.abs(np.cos(poses[:, 2])), np.abs(np.sin(poses[:, 2]))
     a, b = box.size[0] / 2, box.size[1] / 2
     extent = np.column_stack([c * a + s * b, s * a + c * b])
-    poses = poses[(np.abs(poses[:, :2]) + extent <= np.array(scene.table.size) / 2).all(axis=1)]
-    for grasp in grasps(box):
-        kept = poses[_reachable(scene, poses, box, bottom, grasp)]
-        if (_gaps(kept, grasp, bottom, standing) >= clearance).any():
-            return True
-    return False
+    spare = np.array(scene.table.size) / 2 - np.abs(poses[:, :2]) - extent
+    return spare.min(axis=1) >= 0
 
 
-def _reachable(
-    scene: Scene, poses: np.ndarray, box: Box, bottom: float, grasp: Grasp
-) -> np.ndarray:
-    """Which positions the downward hand reaches, at the box and lifted (N,) bool."""
-    base = scene.robot.base
-    height = bottom + box.size[2] / 2 + grasp.above - base[2]
-    r = np.hypot(poses[:, 0] - base[0], poses[:, 1] - base[1])
-    good = np.ones(len(poses), dtype=bool)
-    for z in (height, height + LIFT):
-        near, far = reach_interval(round(z, 3))
-        good &= (r >= near + 0.004) & (r <= far - 0.004)
-    return good
+def _over(poses: np.ndarray, hold: Hold) -> np.ndarray:
+    """Where the hand is (N, 3), x, y, angle of the finger axis, when the box is at the poses."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    a, b = hold.offset
+    x, y = poses[:, 0] + c * a - s * b, poses[:, 1] + s * a + c * b
+    return np.column_stack([x, y, poses[:, 2] + hold.turn])
 
 
-def _gaps(
+def _reached_by(scene: Scene, box: Box, poses: np.ndarray, bottom: float, way: _Way) -> np.ndarray:
+    hand = _over(poses, way.hold)
+    z = bottom + box.size[2] - way.depth + panda().finger_tip
+    return _reached(scene, hand[:, 0], hand[:, 1], np.full(len(hand), z), hand[:, 2])
+
+
+def _hand_rows(box: Box, pose: np.ndarray, bottom: float, way: _Way) -> np.ndarray:
+    """The hand at a box as rows up to the sky, (P, 7)."""
+    [(x, y, angle)] = _over(pose[None, :3], way.hold)
+    c, s = math.cos(angle), math.sin(angle)
+    low = bottom + box.size[2] - way.depth
+    return np.array(
+        [
+            (x + c * y0 - s * x0, y + s * y0 + c * x0, angle, half_y, half_x, low + up, math.inf)
+            for y0, x0, half_y, half_x, up in way.hold.parts
+        ]
+    )
+
+
+def _hits(
     poses: np.ndarray,
-    grasp: Grasp,
-    bottom: float,
-    standing: Iterable[Box],
-    *,
-    hand_only: bool = False,
+    parts: np.ndarray,
+    low: np.ndarray,
+    rows: Sequence[np.ndarray],
+    clearance: float,
 ) -> np.ndarray:
-    """Least gap (N,) of box and gripper to what rises above their undersides, m."""
-    best = np.full(len(poses), np.inf)
-    angle = poses[:, 2] + grasp.axis * math.pi / 2
-    axes = np.stack([np.cos(angle), np.sin(angle)], axis=-1)  # (N, 2), the finger axis
-    for i, (offset, along, across, under) in enumerate(grasp.parts):
-        if i == 0 and hand_only:
-            continue
-        centre = poses[:, :2] + offset * axes
-        low = bottom + under
-        for other in standing:
-            # The box itself comes down onto its support, the gripper stays clear of it.
-            if other.top > low + (1e-3 if i == 0 else -0.003):
-                best = np.minimum(best, _gap(centre, axes, along, across, other))
-    return best
+    """Which rows are nearer than `clearance` to parts that come straight down, (N, K) bool.
+
+    low (P,): heights of the undersides. What stays below them is in nobody's way; the support of
+    a box, which its underside touches, neither.
+    """
+    there = np.vstack(rows)
+    found = np.zeros((len(poses), len(there)), dtype=bool)
+    along = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    for (offset, aside, a, b, up), under in zip(parts, low, strict=True):
+        centre = poses[:, :2] + offset * along + aside * across
+        spare = TOUCH if len(parts) == 1 and up == 0.0 else -clearance
+        for k in np.flatnonzero(there[:, 6] > under + spare):
+            near = np.hypot(*(centre - there[k, :2]).T) < (
+                math.hypot(a, b) + math.hypot(there[k, 3], there[k, 4]) + clearance
+            )
+            near &= ~found[:, k]
+            at = np.flatnonzero(near)
+            gap = footprints_gap(centre[at], along[at], a, b, there[k])
+            found[at[gap < clearance], k] = True
+    return found
 
 
-def _gap(
-    centre: np.ndarray, axes: np.ndarray, along: float, across: float, other: Box
+def footprints_gap(
+    centre: np.ndarray, along: np.ndarray, a: float, b: float, row: np.ndarray
 ) -> np.ndarray:
-    """Separating-axis gap (N,) of N equal rectangles and a box's footprint, m."""
-    d = np.array(other.position[:2]) - centre
-    normal = np.stack([-axes[:, 1], axes[:, 0]], axis=-1)
-    c, s = math.cos(other.yaw), math.sin(other.yaw)
-    u, v = np.array([c, s]), np.array([-s, c])
-    a, b = other.size[0] / 2, other.size[1] / 2
-    cos, sin = np.abs(axes @ u), np.abs(axes @ v)  # of the angle between the two
+    """Separating-axis gap (N,) of N equal rectangles and the one of a row, m.
+
+    centre (N, 2); along (N, 2): unit vectors of the edges 2 a; the others are 2 b.
+    """
+    d = row[:2] - centre
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    u = np.array([math.cos(row[2]), math.sin(row[2])])
+    v = np.array([-u[1], u[0]])
+    cos, sin = np.abs(along @ u), np.abs(along @ v)  # of the angle between the two
     return np.max(
         [
-            np.abs((d * axes).sum(axis=1)) - along - a * cos - b * sin,
-            np.abs((d * normal).sum(axis=1)) - across - a * sin - b * cos,
-            np.abs(d @ u) - a - along * cos - across * sin,
-            np.abs(d @ v) - b - along * sin - across * cos,
+            np.abs((d * along).sum(axis=1)) - a - row[3] * cos - row[4] * sin,
+            np.abs((d * across).sum(axis=1)) - b - row[3] * sin - row[4] * cos,
+            np.abs(d @ u) - row[3] - a * cos - b * sin,
+            np.abs(d @ v) - row[4] - a * sin - b * cos,
         ],
         axis=0,
     )

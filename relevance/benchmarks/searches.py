@@ -8,9 +8,17 @@ from functools import partial
 
 import numpy as np
 
-from relevance.benchmarks import plots
-from relevance.benchmarks.runs import Measured, Plot, Progress, interval, share
-from relevance.benchmarks.speed import DEFAULTS, Planned, planned
+from relevance.benchmarks.plots import scaling_plot
+from relevance.benchmarks.runs import (
+    DEFAULTS,
+    Measured,
+    Planned,
+    Plot,
+    Progress,
+    interval,
+    planned,
+    share,
+)
 from relevance.benchmarks.tasks import Task
 from relevance.planner import PlannerConfig, warm_up
 from relevance.report.tables import Table
@@ -103,7 +111,7 @@ def measure_scaling(
         name="scaling",
         rows=tuple(rows),
         tables=(scaling_table(rows, config),),
-        plots=(Plot(name="scaling", draw=partial(plots.scaling, rows=rows), panels=3),),
+        plots=(Plot(name="scaling", draw=partial(scaling_plot, rows=rows), panels=3),),
     )
 
 

@@ -4,105 +4,30 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from relevance.benchmarks import plots
+from relevance.benchmarks.plots import speed_plot, truth_plot
 from relevance.benchmarks.runs import (
+    DEFAULTS,
     TIMES,
     Measured,
+    Planned,
     Plot,
     Progress,
     interval,
     milliseconds,
+    planned,
     share,
 )
 from relevance.benchmarks.tasks import Task
-from relevance.planner import PlannerConfig, PlanResult, penetration, plan, warm_up
+from relevance.planner import PlannerConfig, PlanResult, penetration, warm_up
 from relevance.report.tables import Table
-from relevance.scene import Scene
 from relevance.simulation import MAX_PENETRATION, replay
 
-DEFAULTS = PlannerConfig()
-"""What is measured unless said otherwise."""
 BOUNDS = ("pose", "keyframe", "path", "rest")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Planned:
-    """One task planned by us, and what the replay said of the plan; s and m."""
-
-    task: int
-    scene_id: str
-    predicate: str
-    subject: str
-    reference: str
-    n_objects: int
-    search: str
-    status: str
-    reason: str
-    n_actions: int
-    moved: tuple[str, ...]
-    ambiguous: bool
-    nodes: int
-    pose_checks: int
-    keyframe_nlps: int
-    path_nlps: int
-    cpu: float
-    wall: float
-    cpu_pose: float
-    cpu_keyframe: float
-    cpu_path: float
-    max_penetration: float | None = None
-    """By the planner's own dense check; None where there is no plan."""
-    replay_ok: bool | None = None
-    replay_max_penetration: float | None = None
-    replay_reason: str = ""
-    replay_cpu: float | None = None
-    check_cpu: float | None = None
-    """Of the dense check alone, made again from the finished plan, its geometry prepared anew."""
-
-    @property
-    def solved(self) -> bool:
-        """Whether there is a plan."""
-        return self.status == "solved"
-
-    @property
-    def cpu_rest(self) -> float:
-        """What no bound accounts for: logic, search, bookkeeping, s."""
-        return self.cpu - self.cpu_pose - self.cpu_keyframe - self.cpu_path
-
-
-def planned(task: Task, config: PlannerConfig) -> tuple[Planned, PlanResult]:
-    """Plan one task, timed."""
-    result, cpu, wall = timed_plan(task, config)
-    row = Planned(
-        task=task.index,
-        scene_id=task.scene.id,
-        predicate=task.goal.predicate.name,
-        subject=task.goal.subject,
-        reference=task.goal.reference,
-        n_objects=task.n_objects,
-        search=config.search,
-        status=result.status,
-        reason=result.reason,
-        n_actions=len(result.actions),
-        moved=result.moved,
-        ambiguous=result.ambiguous,
-        nodes=result.counts.nodes,
-        pose_checks=result.counts.pose,
-        keyframe_nlps=result.counts.keyframe,
-        path_nlps=result.counts.path,
-        cpu=cpu,
-        wall=wall,
-        cpu_pose=result.seconds.pose,
-        cpu_keyframe=result.seconds.keyframe,
-        cpu_path=result.seconds.path,
-        max_penetration=result.max_penetration if result.status == "solved" else None,
-    )
-    return row, result
 
 
 def replayed(row: Planned, task: Task, result: PlanResult) -> Planned:
@@ -127,14 +52,6 @@ def rechecked(row: Planned, task: Task, result: PlanResult) -> Planned:
     began = time.process_time()
     penetration(task.scene, result)
     return replace(row, check_cpu=time.process_time() - began)
-
-
-def timed_plan(task: Task, config: PlannerConfig) -> tuple[PlanResult, float, float]:
-    """The plan, and the CPU and wall seconds that it took."""
-    scene: Scene = task.scene
-    wall, cpu = time.perf_counter(), time.process_time()
-    result = plan(scene, task.goal, config=config, replay=False)
-    return result, time.process_time() - cpu, time.perf_counter() - wall
 
 
 def measure_planning(
@@ -166,13 +83,13 @@ def measure_planning(
     drawn: list[Plot] = []
     if speed:
         tables += [speed_table(rows), bounds_table(rows), boxes_table(rows)]
-        drawn.append(Plot(name="speed", draw=partial(plots.speed, rows=rows), panels=2))
+        drawn.append(Plot(name="speed", draw=partial(speed_plot, rows=rows), panels=2))
     if truth:
         tables += [truth_table(rows)]
         refused = [row for row in rows if row.replay_ok is False]
         if refused:
             tables.append(refused_table(refused))
-        drawn.append(Plot(name="truth", draw=partial(plots.truth, rows=rows)))
+        drawn.append(Plot(name="truth", draw=partial(truth_plot, rows=rows)))
     return Measured(name="tasks", rows=tuple(rows), tables=tuple(tables), plots=tuple(drawn))
 
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from relevance.benchmarks.runs import Measured, Progress, share
-from relevance.benchmarks.speed import DEFAULTS
+from relevance.benchmarks.runs import DEFAULTS, Measured, Progress, share
 from relevance.benchmarks.tasks import BenchmarkError, Task
 from relevance.planner import PlannerConfig, PlanResult, plan, warm_up
 from relevance.report.tables import Table

@@ -6,6 +6,9 @@ A target is one more maker and one more entry `bench TARGET` of COMMANDS.
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import csv
 import dataclasses
+import functools
+import itertools
+import math
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -22,8 +25,12 @@ PARTS: tuple[Part, ...] = (
 Parts = Annotated[tuple[Part, ...] | None, tyro.conf.arg(metavar="PART")]
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="N")]
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")]
+OptionalCheckout = Annotated[Path | None, tyro.conf.arg(metavar="CHECKOUT")]
 Count = Annotated[int, tyro.conf.arg(metavar="N")]
 Seconds = Annotated[float, tyro.conf.arg(metavar="S")]
+Scenes = Literal["ours", "foreign"]
+EXCEPTIONS = "exceptions.jsonl"
+"""Tasks of all parts in which a referee does better."""
 Work = Callable[[Callable[[int, int], None]], Any]
 """A part of the benchmark: called with progress, returns what it measured."""
 
@@ -36,72 +43,152 @@ def bench_planner(_: Any) -> Callable[..., int]:
         seed: OptionalInt = None,
         out: OptionalPath = None,
         parts: Parts = None,
+        scenes: Scenes = "ours",
         against: Literal["rai"] | None = None,
+        unsolved: Count = 0,
         limit: Seconds = 30.0,
+        versus: OptionalCheckout = None,
     ) -> int:
         """Measure the planner on random tasks that nothing was tuned on, on one core.
 
         Prints tables and writes them (summary.json), a CSV file with one row a task for every
-        part, the scenes (JSON lines, for `relevance plan`) and plots (PNG and SVG).
+        part, the scenes (JSON lines, for `relevance plan`) and plots (PNG and SVG). Tasks in
+        which a referee does better than the planner are in exceptions.jsonl.
 
         Args:
             tasks: How many tasks speed, truth and stability look at; searches and completeness
-                take half as many, scaling a 50th for each number of boxes.
+                take half as many, scaling a 50th for each number of boxes, the growth of
+                --versus a tenth.
             seed: Remakes the tasks of an earlier run; a fresh one when not given.
             out: Folder for rows and plots; data/bench/planner-SEED when not given.
-            parts: What to measure; everything when not given (with --against only that).
+            parts: What to measure; everything when not given (with --against or --versus
+                only that).
+            scenes: How the scenes are drawn: by our sampler, or boxes thrown anywhere within
+                reach, as other people make them (scaling and growth: always ours).
             against: Another planner that takes turns with ours on the same tasks.
+            unsolved: With --against: how many tasks that ours leaves unsolved the other is asked
+                besides, two at a time (at most 100 times as many are drawn for it).
             limit: CPU seconds that the other planner has for a task.
+            versus: Folder of another checkout of this project, whose planner takes turns with
+                this one on the same tasks, and on a tenth as many of 30 boxes.
         """
-        if tasks < 1:
-            raise UsageError(f"--tasks {tasks}: expected at least 1")
-        if seed is not None and not 0 <= seed < 2**63:
-            raise UsageError(f"--seed {seed}: expected 0 to 2**63 - 1")
+        _require("--tasks", tasks, tasks >= 1, "at least 1")
+        _require("--seed", seed, seed is None or 0 <= seed < 2**63, "0 to 2**63 - 1")
+        _require("--unsolved", unsolved, unsolved >= 0, "at least 0")
+        _require("--unsolved", unsolved, not unsolved or against is not None, "--against as well")
+        _require("--limit", limit, 0 < limit < math.inf, "a number over 0")
         seed = secrets.randbits(32) if seed is None else seed
         if against:
             from relevance.planner.rai.planner import require_rai
 
             require_rai()
-        chosen = parts if parts is not None else () if against else PARTS
+        chosen = parts if parts is not None else () if against or versus else PARTS
         folder = out or Path("data/bench") / f"planner-{seed}"
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / EXCEPTIONS).unlink(missing_ok=True)
+        except OSError as error:
+            raise UsageError(f"--out {folder}: {error.strerror}, expected a folder") from None
         say(f"--seed {seed} remakes these tasks; rows and plots go to {folder}")
         tables: list[Any] = []
-        for name, work in _work(tasks, seed, chosen, against, limit, folder):
+        work = _work(tasks, seed, chosen, scenes, folder)
+        if against:
+            work = itertools.chain(
+                _against(against, tasks, unsolved, limit, seed, scenes, folder), work
+            )
+        if versus:
+            work = itertools.chain(_versus(versus, tasks, seed, scenes, folder), work)
+        for name, measure in work:
             with bar(name) as progress:
-                measured = work(progress)
+                measured = measure(progress)
             hand_over(measured, folder)
             tables += measured.tables
-            summary = {"seed": seed, "tasks": tasks, "parts": list(chosen), "against": against}
-            summary["tables"] = [dataclasses.asdict(table) for table in tables]
+            summary = {
+                "seed": seed,
+                "tasks": tasks,
+                "scenes": scenes,
+                "parts": list(chosen),
+                "against": against,
+                "versus": versus,
+                "tables": [dataclasses.asdict(table) for table in tables],
+            }
             (folder / "summary.json").write_text(to_json(summary) + "\n")
         return 0
 
     return bench
 
 
+def _require(flag: str, value: object, good: bool, expected: str) -> None:
+    if not good:
+        raise UsageError(f"{flag} {value}: expected {expected}")
+
+
+def _against(
+    name: str, tasks: int, unsolved: int, limit: float, seed: int, scenes: Scenes, folder: Path
+) -> Iterator[tuple[str, Work]]:
+    """Ours and another planner."""
+    from relevance import benchmarks
+    from relevance.planner.rai.planner import RaiConfig, plan_rai
+
+    drawn = benchmarks.draw(tasks, seed, scenes=scenes)
+    _write_scenes(folder / "scenes.jsonl", drawn)
+    hard: list[Any] = []
+    if unsolved:
+        with bar("tasks that ours leaves unsolved") as progress:
+            hard = benchmarks.find_unsolved(unsolved, seed, scenes=scenes, progress=progress)
+        _write_scenes(folder / "scenes-unsolved.jsonl", hard)
+        if len(hard) < unsolved:
+            say(f"only {len(hard)} tasks are unsolved of those drawn")
+    yield (
+        f"ours and {name}",
+        lambda progress: benchmarks.measure_against(
+            drawn,
+            functools.partial(plan_rai, config=RaiConfig(seconds=limit), replay=False),
+            name=name,
+            unsolved=hard,
+            processes=2,
+            progress=progress,
+        ),
+    )
+
+
+def _versus(
+    checkout: Path, tasks: int, seed: int, scenes: Scenes, folder: Path
+) -> Iterator[tuple[str, Work]]:
+    """This planner and the one of another checkout."""
+    from relevance import benchmarks
+
+    drawn = benchmarks.draw(tasks, seed, scenes=scenes)
+    most = benchmarks.SIZES[-1]
+    grown = benchmarks.draw(
+        max(tasks // 10, 1),
+        seed,
+        boxes=(most, most),
+        max_edge=benchmarks.MAX_EDGE,
+        stream="bench growth",
+    )
+    _write_scenes(folder / "scenes.jsonl", drawn)
+    _write_scenes(folder / "scenes-growth.jsonl", grown)
+    yield (
+        "tasks by both checkouts",
+        lambda progress: benchmarks.measure_versus(
+            drawn, checkout, growth=grown, growth_config=benchmarks.CAPPED, progress=progress
+        ),
+    )
+
+
 def _work(
-    tasks: int, seed: int, parts: Sequence[Part], against: str | None, limit: float, folder: Path
+    tasks: int, seed: int, parts: Sequence[Part], scenes: Scenes, folder: Path
 ) -> Iterator[tuple[str, Work]]:
     """The parts to measure, with their names; each draws its tasks when its turn comes."""
     from relevance import benchmarks
     from relevance.benchmarks import draw
 
-    drawn = draw(tasks, seed)
+    if not parts:
+        return
+    drawn = draw(tasks, seed, scenes=scenes)
+    half = drawn[: max(tasks // 2, 1)]
     _write_scenes(folder / "scenes.jsonl", drawn)
-    if against:
-        from relevance.planner.rai.planner import RaiConfig, plan_rai
-
-        config = RaiConfig(seconds=limit)
-        yield (
-            f"ours and {against}",
-            lambda progress: benchmarks.measure_against(
-                drawn,
-                lambda scene, goal: plan_rai(scene, goal, config=config, replay=False),
-                name=against,
-                progress=progress,
-            ),
-        )
     if {"speed", "truth"} & set(parts):
         speed, truth = "speed" in parts, "truth" in parts
         yield (
@@ -116,17 +203,14 @@ def _work(
             lambda progress: benchmarks.measure_stability(drawn, seed=seed, progress=progress),
         )
     if "searches" in parts:
-        half = drawn[: max(tasks // 2, 1)]
         yield (
             "tasks by both searches",
             lambda progress: benchmarks.measure_searches(half, progress=progress),
         )
     if "completeness" in parts:
-        small = draw(max(tasks // 2, 1), seed, boxes=(3, 5), stream="bench small")
-        _write_scenes(folder / "scenes-completeness.jsonl", small)
         yield (
             "tasks solved by exhaustion",
-            lambda progress: benchmarks.measure_completeness(small, progress=progress),
+            lambda progress: benchmarks.measure_completeness(half, progress=progress),
         )
     if "scaling" in parts:
         each = max(tasks // 50, 1)
@@ -159,13 +243,16 @@ def hand_over(measured: Any, folder: Path) -> None:
         writer.writerows(records)
     for plot in measured.plots:
         save(plot, folder)
+    if measured.exceptions:
+        _write_scenes(folder / EXCEPTIONS, measured.exceptions, mode="a")
 
 
-def _write_scenes(file: Path, tasks: Sequence[Any]) -> None:
+def _write_scenes(file: Path, tasks: Sequence[Any], mode: Literal["w", "a"] = "w") -> None:
     """The tasks as `relevance plan` reads them, one scene with its goal a line."""
     from relevance.scene import scene_to_json
 
     lines = [
         scene_to_json(dataclasses.replace(task.scene, goals=(str(task.goal),))) for task in tasks
     ]
-    file.write_text("".join(f"{line}\n" for line in lines))
+    with file.open(mode, encoding="utf-8") as opened:
+        opened.writelines(f"{line}\n" for line in lines)
