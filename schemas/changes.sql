@@ -6,11 +6,11 @@
 -- config_hash and policy.
 CREATE OR REPLACE VIEW all_plans AS
 SELECT *, true AS current FROM plans
-UNION ALL SELECT *, false AS current FROM beside_plans;
+UNION ALL BY NAME SELECT *, false AS current FROM beside_plans;
 
 CREATE OR REPLACE VIEW all_labels AS
 SELECT *, true AS current FROM labels
-UNION ALL SELECT *, false AS current FROM beside_labels;
+UNION ALL BY NAME SELECT *, false AS current FROM beside_labels;
 
 -- Every way in which this dataset was labelled.
 CREATE OR REPLACE VIEW labellings AS
@@ -66,8 +66,9 @@ SELECT
     o.scene_id, o.split, o.shard, o.predicate, o.subject, o.reference, o.query, o.is_goal_object,
     o.planner_version, n.planner_version, o.config_hash, n.config_hash, o.policy, NULL,
     o.relevant, NULL,
-    'no plan that holds now: ' || CASE WHEN n.reason <> '' THEN n.reason
-        ELSE coalesce(n.replay_reason, n.status) END
+    'no plan that holds now: ' || coalesce(
+        nullif(n.reason, ''), nullif(n.replay_reason, ''), n.status
+    )
 FROM beside_labels AS o
 JOIN plans AS n USING (scene_id, split, predicate, subject, reference)
 WHERE NOT n.holds
@@ -76,8 +77,9 @@ SELECT
     n.scene_id, n.split, n.shard, n.predicate, n.subject, n.reference, n.query, n.is_goal_object,
     o.planner_version, n.planner_version, o.config_hash, n.config_hash, NULL, n.policy,
     NULL, n.relevant,
-    'no plan that held before: ' || CASE WHEN o.reason <> '' THEN o.reason
-        ELSE coalesce(o.replay_reason, o.status) END
+    'no plan that held before: ' || coalesce(
+        nullif(o.reason, ''), nullif(o.replay_reason, ''), o.status
+    )
 FROM labels AS n
 JOIN beside_plans AS o USING (scene_id, split, predicate, subject, reference)
 WHERE NOT o.holds;

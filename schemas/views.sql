@@ -91,18 +91,19 @@ WHERE holds
 GROUP BY predicate, split, n_actions
 ORDER BY ALL;
 
--- Goals that made no labels, by reason; a solved plan that a check refuted stands here too.
+-- Goals that made no labels, by reason; a plan that a check refuted or that the replay refused
+-- stands here too.
 CREATE OR REPLACE VIEW plan_failures AS
 SELECT
     predicate, split,
     CASE
         WHEN status <> 'solved' THEN status
         WHEN NOT check_ok THEN 'refuted by the dense check'
-        ELSE 'refuted by the replay'
+        ELSE 'refused'
     END AS status,
     CASE
-        WHEN status <> 'solved' THEN reason
-        WHEN NOT check_ok THEN reason
+        WHEN status = 'refused' THEN coalesce(nullif(replay_reason, ''), reason)
+        WHEN status <> 'solved' OR NOT check_ok THEN reason
         ELSE replay_reason
     END AS reason,
     count(*) AS goals

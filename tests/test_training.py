@@ -66,7 +66,11 @@ def label(dataset: Dataset) -> None:
     """Labels by a rule that needs no planner: the subject, and what stands within 20 cm of it."""
     for predicate in PREDICATES.values():
         for split in ("train", "validation"):
-            for shard in dataset.shards(split, predicate.family):
+            for shard in (
+                spec["shard"]
+                for spec in dataset.description["shards"]
+                if (spec["split"], spec["family"]) == (split, predicate.family)
+            ):
                 rows = []
                 for sample in dataset.samples(split, [shard]):
                     scene = sample.scene

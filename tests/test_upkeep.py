@@ -267,7 +267,6 @@ def test_merging_by_reference(made: Path, tmp_path: Path) -> None:
     for split in ("train", "test"):
         numbers = [part.shards(split) for part in parts]
         assert merged.shards(split) == [*range(sum(map(len, numbers)))]
-        assert merged.shards(split, "on") == sorted(merged.shards(split, "on"))
         keys = [sample.key for part in parts for sample in part.samples(split)]
         assert [sample.key for sample in merged.samples(split)] == keys
         for table in ("scenes", "plans", "labels"):
@@ -448,11 +447,8 @@ def test_gathered_labels_answer_the_same_until_the_shards_change(made: Path) -> 
     assert {file.parts[-7] for file in gathered} == {"policy=found"}
     assert [sql(made, query) for query in queries] == before
     assert check(made, render=False) == []
-    # what is gathered is what is read
+    # what is not whole is not read
     gathered[0].unlink()
-    assert sql(made, queries[0]) != before[0]
-    changed = Dataset.open(made).files("labels")[0]
-    changed.write_bytes(changed.read_bytes())
     assert [sql(made, query) for query in queries] == before
 
 

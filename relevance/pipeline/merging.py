@@ -86,7 +86,7 @@ def _way(target: Path, source: Path) -> str:
     """A way to a source that goes along when both are moved together."""
     if is_remote(source) or is_remote(target):
         return str(source)
-    return os.path.relpath(source, target)
+    return os.path.relpath(source.resolve(), target.resolve())
 
 
 def _same(head: Dataset, other: Dataset) -> None:

@@ -4,10 +4,14 @@ The only importer of pyarrow, duckdb and webdataset.
 """
 
 from relevance.store.compacting import compact
-from relevance.store.dataset import SPLITS, Dataset, Labelling, Source, differences
+from relevance.store.dataset import Dataset
 from relevance.store.exporting import export
+from relevance.store.files import SPLITS, Source, differences
 from relevance.store.images import MEMBERS, VIEW_SIZE, Pictures, Sample, decode, undecoded
-from relevance.store.places import (
+from relevance.store.labellings import Labelling
+from relevance.store.parquet import empty_size
+from relevance.store.paths import (
+    DatasetError,
     absolute,
     copy_file,
     file_hash,
@@ -22,9 +26,7 @@ from relevance.store.tables import (
     SCHEMAS,
     TABLES,
     Column,
-    DatasetError,
     TableSchema,
-    empty_size,
     table_schema,
     type_name,
 )

@@ -1,99 +1,159 @@
 """Compaction: many small label files gathered into few large ones, for fast queries.
 
-Rows are put into one file for each value of the flags that label queries ask for (`relevant`,
-`is_goal_object`, `ambiguous`), as folders that DuckDB takes for columns: counting by them reads
-no row at all. The shards stay what counts; the gathered files are a copy that queries use as
-long as its manifest names exactly the shards that are there (by name, size and time of change).
-Anything else, and queries read the shards again.
+Rows are put into one file for each value of the flags that label queries ask for (`gathered` in
+the table's schema), and a view says each file's values as constants: counting by them reads no
+row at all. The shards stay what counts; the gathered files are a copy that queries use as long
+as its manifest names exactly the shards that are there, by name and hash, and the gathered files
+are those that were written. Anything else, and queries read the shards again.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import duckdb
 
-from relevance.store.places import is_remote, quoted
-from relevance.store.tables import DatasetError, table_schema
-
-if TYPE_CHECKING:
-    from relevance.store.dataset import Dataset
+from relevance.store.files import Files
+from relevance.store.parquet import content_mark
+from relevance.store.paths import (
+    DatasetError,
+    file_hash,
+    is_remote,
+    keys_of,
+    replacing,
+    writing,
+)
+from relevance.store.scans import columns, literal, reading, scans
+from relevance.store.tables import TABLES, one_line, table_schema
 
 FOLDER = "compacted"
-TABLES = ("labels",)
-FLAGS = ("is_goal_object", "relevant", "ambiguous")
 ROW_GROUP = 1_000_000
+KEYS = ("policy", "predicate", "split")
+"""What a gathered file's folders say besides the flags."""
 
 
-def compact(dataset: Dataset) -> dict[str, int]:
-    """Gather the current labels by predicate, split and flags; rows by table."""
+def compact(dataset: Files) -> dict[str, int]:
+    """Gather the current labels by predicate, split and flags; rows by table.
+
+    An earlier copy stays in use until the new one is whole. Raises DatasetError for a merged or
+    remote dataset, labels of several policies, and where nothing can be written.
+    """
     if is_remote(dataset.path) or dataset.sources:
         raise DatasetError(f"{dataset.path}: expected a local dataset that is not a merged one")
-    folder = dataset.path / FOLDER
-    shutil.rmtree(folder, ignore_errors=True)
-    rows: dict[str, int] = {}
-    for table in TABLES:
-        listed = _listing(dataset, table)
-        policies = {dataset.metadata(file).get("policy") for file in dataset.files(table)}
-        if not listed:
-            continue
-        if len(policies) != 1 or None in policies:
-            found = ", ".join(sorted(map(str, policies)))
-            raise DatasetError(f"{dataset.path}: {table}: expected one policy, found {found}")
-        [policy] = policies
+    return {
+        table: _compact(dataset, table)
+        for table in TABLES
+        if table_schema(table).gathered and dataset.files(table)
+    }
+
+
+def _compact(dataset: Files, table: str) -> int:
+    footers = {file: dataset.metadata(file) for file in dataset.files(table)}
+    policies = {footer.get("policy") for footer in footers.values()}
+    if len(policies) != 1 or None in policies:
+        found = ", ".join(sorted(map(str, policies)))
+        raise DatasetError(f"{dataset.path}: {table}: expected one policy, found {found}")
+    [policy] = policies
+    manifest = dataset.path / FOLDER / f"{table}.json"
+    with _emptied(manifest.parent / f"{table}-{os.urandom(4).hex()}") as folder:
+        rows = 0
         for (predicate, split), files in _groups(dataset, table).items():
-            target = folder / table / f"policy={policy}/predicate={predicate}/split={split}"
-            target.mkdir(parents=True)
-            rows[table] = rows.get(table, 0) + _gather(table, files, target)
+            target = folder / f"policy={policy}/predicate={predicate}/split={split}"
+            with writing(target, target, dataset.path):
+                target.mkdir(parents=True)
+            versions = {file: int(footers[file]["version"]) for file in files}
+            rows += _gather(dataset, table, versions, target)
+        listed = {
+            "version": table_schema(table).version,
+            "folder": folder.name,
+            "shards": {dataset.name_of(f): footer["sha256"] for f, footer in footers.items()},
+            "files": {
+                str(file.relative_to(folder)): [*_state(file), file_hash(file)]
+                for file in sorted(folder.rglob("*.parquet"))
+            },
+        }
         # last: without its manifest a half-made copy is not used
-        (folder / f"{table}.json").write_text(json.dumps(listed))
+        with replacing(manifest) as temporary:
+            temporary.write_text(json.dumps(listed))
+    for old in manifest.parent.glob(f"{table}*"):
+        if old.is_dir() and old != folder:
+            shutil.rmtree(old, ignore_errors=True)
     return rows
 
 
-def fresh(dataset: Dataset) -> dict[str, str]:
-    """The tables whose gathered files are those of today's shards, with what to read (SQL)."""
-    found: dict[str, str] = {}
-    if is_remote(dataset.path) or dataset.sources:
-        return found
-    for table in TABLES:
-        folder = dataset.path / FOLDER
-        manifest = folder / f"{table}.json"
-        if manifest.is_file() and json.loads(manifest.read_text()) == _listing(dataset, table):
-            files = sorted((folder / table).rglob("*.parquet"))
-            found[table] = "[" + ", ".join(quoted(file.resolve()) for file in files) + "]"
-    return found
+@contextmanager
+def _emptied(folder: Path) -> Iterator[Path]:
+    """A folder that is gone again when the block fails."""
+    try:
+        yield folder
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
-def _listing(dataset: Dataset, table: str) -> list[list[Any]]:
-    listed = []
-    for file in dataset.files(table):
-        known = file.stat()
-        listed.append([dataset.name_of(file), known.st_size, known.st_mtime_ns])
-    return listed
+def fresh(dataset: Files, table: str) -> str | None:
+    """A SELECT over the gathered files of a table; None unless they are those of today's shards."""
+    schema = table_schema(table)
+    manifest = dataset.path / FOLDER / f"{table}.json"
+    if not schema.gathered or is_remote(dataset.path) or not manifest.is_file():
+        return None
+    try:
+        listed = json.loads(manifest.read_text(encoding="utf-8"))
+        folder = manifest.parent / listed["folder"]
+        known = listed["version"] == schema.version and bool(listed["files"])
+        if not known or listed["shards"] != _shards(dataset, table):
+            return None
+        for name, (size, changed, digest) in listed["files"].items():
+            file = folder / name
+            if _state(file) != [size, changed] and file_hash(file) != digest:
+                return None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # half a copy, or one of another age: the shards are read
+    keys = (*KEYS, *schema.gathered)
+    parts = []
+    for place, names in groupby(sorted(listed["files"]), key=lambda name: Path(name).parent):
+        said = keys_of(place / "x")
+        constants = {key: literal(said[key]) for key in keys}
+        files = [folder / name for name in names]
+        parts.append(f"SELECT {columns(schema, None, constants)} FROM {reading(files)}")
+    return " UNION ALL ".join(parts)
 
 
-def _groups(dataset: Dataset, table: str) -> dict[tuple[str, str], list[Path]]:
+def _shards(dataset: Files, table: str) -> dict[str, str | None]:
+    """The hash of each shard by its name."""
+    return {dataset.name_of(file): content_mark(file) for file in dataset.files(table)}
+
+
+def _state(file: Path) -> list[int]:
+    known = file.stat()
+    return [known.st_size, known.st_mtime_ns]
+
+
+def _groups(dataset: Files, table: str) -> dict[tuple[str, str], list[Path]]:
     groups: dict[tuple[str, str], list[Path]] = {}
     for file in dataset.files(table):
-        dataset.metadata(file)
         keys = dataset.file_keys(file)
         groups.setdefault((keys["predicate"], keys["split"]), []).append(file)
     return groups
 
 
-def _gather(table: str, files: list[Path], target: Path) -> int:
-    listed = ", ".join(quoted(file.resolve()) for file in files)
-    columns = ", ".join(f'"{column.name}"' for column in table_schema(table).columns)
-    place = str(target).replace("'", "''")
+def _gather(dataset: Files, table: str, versions: dict[Path, int], target: Path) -> int:
+    schema = table_schema(table)
+    body = " UNION ALL ".join(scans(dataset, schema, versions))
     with duckdb.connect() as connection:
         connection.execute("SET enable_progress_bar = false")
-        made = connection.execute(
-            f"COPY (SELECT {columns} FROM read_parquet([{listed}], hive_partitioning = false)) "
-            f"TO '{place}' (FORMAT parquet, COMPRESSION zstd,"
-            f" ROW_GROUP_SIZE {ROW_GROUP}, PARTITION_BY ({', '.join(FLAGS)}))"
-        ).fetchone()
-    assert made is not None, "COPY says how many rows it wrote"
+        try:
+            made: Any = connection.execute(
+                f"COPY ({body}) TO {literal(str(target))} (FORMAT parquet, COMPRESSION zstd,"
+                f" ROW_GROUP_SIZE {ROW_GROUP}, PARTITION_BY ({', '.join(schema.gathered)}))"
+            ).fetchone()
+        except duckdb.Error as error:
+            raise DatasetError(f"{target}: cannot be written ({one_line(error)})") from None
     return int(made[0])

@@ -12,28 +12,30 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import shutil
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from relevance.store.places import is_remote, locate, replacing
-from relevance.store.tables import DatasetError, table_schema
-
-if TYPE_CHECKING:
-    from relevance.store.dataset import Dataset
+from relevance.store.dataset import Dataset
+from relevance.store.files import SPLITS
+from relevance.store.paths import DatasetError, is_remote, locate, replacing, writing
+from relevance.store.tables import TABLES, table_schema
 
 PICTURES = {"image": "scene.webp", "mask": "mask.png", "views": "views.webp"}
 """Columns of images, and the member of the tar that each is."""
 _PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 _ROWS = {
-    "scenes": "One row a scene: its images and everything that was drawn for it.",
-    "plans": "One row a goal: the plan that was found, or why there is none.",
-    "labels": "One row an object of a scene and goal with a plan: is it relevant?",
+    schema.name: schema.exported
+    for schema in sorted(map(table_schema, TABLES), key=lambda s: s.name != "scenes")
+    if schema.exported
 }
+_HALF = ".half"
+"""Where an export is made before it takes the place of an earlier one."""
 
 Progress = Callable[[int, int], None]
 
@@ -47,8 +49,9 @@ def export(dataset: Dataset, out: str | Path, progress: Progress | None = None) 
     out = locate(out)
     if is_remote(out):
         raise DatasetError(f"{out}: expected a local folder to export to")
-    if out.exists() and any(item.name not in {"README.md", *_ROWS} for item in out.iterdir()):
-        raise DatasetError(f"{out}: expected an empty folder or an earlier export")
+    with writing(out, out):
+        if out.exists() and any(i.name not in {"README.md", _HALF, *_ROWS} for i in out.iterdir()):
+            raise DatasetError(f"{out}: expected an empty folder or an earlier export")
     jobs = [
         (table, split, files)
         for table in _ROWS
@@ -57,9 +60,32 @@ def export(dataset: Dataset, out: str | Path, progress: Progress | None = None) 
     ]
     if not any(table == "scenes" for table, _, _ in jobs):
         raise DatasetError(f"{dataset.path}: expected scenes to export, found none")
+    half = out / _HALF
+    shutil.rmtree(half, ignore_errors=True)
+    try:
+        rows = _write(dataset, half, jobs, progress)
+        with replacing(half / "README.md") as temporary:
+            temporary.write_text(_card(dataset, rows), encoding="utf-8")
+        with writing(out, out):
+            for name in (*_ROWS, "README.md"):
+                if (out / name).is_dir():
+                    shutil.rmtree(out / name)
+                if (half / name).exists():
+                    os.replace(half / name, out / name)
+    finally:
+        shutil.rmtree(half, ignore_errors=True)
+    return out
+
+
+def _write(
+    dataset: Dataset,
+    out: Path,
+    jobs: list[tuple[str, str, list[Path]]],
+    progress: Progress | None,
+) -> dict[tuple[str, str], int]:
+    """Write the files of each table and split; how many rows they have."""
     done, total = 0, sum(len(files) for _, _, files in jobs)
     rows: dict[tuple[str, str], int] = {}
-    written: set[Path] = set()
     for table, split, files in jobs:
         for number, file in enumerate(files):
             body = dataset.read_file(file)
@@ -69,23 +95,14 @@ def export(dataset: Dataset, out: str | Path, progress: Progress | None = None) 
             target = out / table / f"{split}-{number:05d}-of-{len(files):05d}.parquet"
             with replacing(target) as temporary:
                 pq.write_table(body, temporary, compression="zstd", row_group_size=10_000)
-            written.add(target)
             rows[table, split] = rows.get((table, split), 0) + len(body)
             done += 1
             if progress:
                 progress(done, total)
-    for table in _ROWS:  # of an earlier export with more or fewer files
-        for old in (out / table).glob("*.parquet"):
-            if old not in written:
-                old.unlink()
-    with replacing(out / "README.md") as temporary:
-        temporary.write_text(_card(dataset, rows))
-    return out
+    return rows
 
 
 def _splits(dataset: Dataset) -> list[str]:
-    from relevance.store.dataset import SPLITS
-
     return [split for split in SPLITS if dataset.shards(split)]
 
 

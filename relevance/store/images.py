@@ -1,19 +1,25 @@
 """Images: what a sample of an image tar holds, encoded and decoded.
 
 Everything is lossless: a stored scene renders again to equal pixels, and a test says so.
+
+Shape suffixes: H and W height and width of the image, N objects of the scene, V their
+views side by side (N * 32 pixels), 3 RGB.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import io
+import tarfile
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
 from relevance.scene import Scene, scene_from_json
-from relevance.store.tables import DatasetError
+from relevance.store.paths import DatasetError
 
 VIEW_SIZE = 32
 """Edge of a canonical view, pixels."""
@@ -47,9 +53,20 @@ class Sample:
     """(H, W) uint8: 0 background and table, 1 + i object i."""
 
 
+def write_tar(path: Path, samples: Iterable[tuple[str, Pictures, str]]) -> None:
+    """Write the image tar of (key, pictures, scene JSON); equal samples, equal bytes."""
+    with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as tar:
+        for key, pictures, scene_json in samples:
+            for member, content in encode(pictures, scene_json).items():
+                # a TarInfo's defaults are time 0, owner 0: equal bytes everywhere
+                info = tarfile.TarInfo(f"{key}.{member}")
+                info.size = len(content)
+                tar.addfile(info, io.BytesIO(content))
+
+
 def encode(pictures: Pictures, scene_json: str) -> dict[str, bytes]:
     """The members of one sample by name, in order."""
-    views = np.concatenate(list(pictures.views), axis=1)
+    wide_HV3 = np.concatenate(list(pictures.views), axis=1)
     # WebP quality over 100 means lossless
     lossless = [cv2.IMWRITE_WEBP_QUALITY, 101]
     # PNG's filters help photographs; flat regions without are smaller, and faster to read
@@ -58,7 +75,7 @@ def encode(pictures: Pictures, scene_json: str) -> dict[str, bytes]:
         "mask.png": _encoded(".png", pictures.mask, unfiltered),
         "scene.json": scene_json.encode(),
         "scene.webp": _encoded(".webp", cv2.cvtColor(pictures.image, cv2.COLOR_RGB2BGR), lossless),
-        "views.webp": _encoded(".webp", cv2.cvtColor(views, cv2.COLOR_RGB2BGR), lossless),
+        "views.webp": _encoded(".webp", cv2.cvtColor(wide_HV3, cv2.COLOR_RGB2BGR), lossless),
     }
 
 
@@ -114,15 +131,15 @@ def decode(item: Mapping[str, Any]) -> Sample:
         return content
 
     scene = scene_from_json(item["scene.json"], where=f"{where}.scene.json")
-    wide = cv2.cvtColor(image("views.webp", cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    wide_HV3 = cv2.cvtColor(image("views.webp", cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
     expected = (VIEW_SIZE, VIEW_SIZE * len(scene.objects), 3)
-    if wide.shape != expected:
-        raise DatasetError(f"{where}.views.webp: expected shape {expected}, found {wide.shape}")
-    views = np.stack(np.split(wide, len(scene.objects), axis=1))
+    if wide_HV3.shape != expected:
+        raise DatasetError(f"{where}.views.webp: expected shape {expected}, found {wide_HV3.shape}")
+    views_NHW3 = np.stack(np.split(wide_HV3, len(scene.objects), axis=1))
     return Sample(
         key=item["__key__"],
         scene=scene,
         image=cv2.cvtColor(image("scene.webp", cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB),
-        views=views,
+        views=views_NHW3,
         mask=image("mask.png", cv2.IMREAD_GRAYSCALE),
     )

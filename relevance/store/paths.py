@@ -7,6 +7,7 @@ whole or not at all, wherever it is. Credentials come from the environment, see 
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
@@ -19,8 +20,35 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
 
+from relevance.errors import RelevanceError
+
 _STALE = 86_400.0  # s; a temporary file of another machine that old belongs to nobody
 _URL = re.compile(r"([a-z][a-z0-9+]+):/+")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
+
+
+class DatasetError(RelevanceError):
+    """A dataset that is not what it should be: file, column, expected and found in one line."""
+
+
+def checked_name(what: str, name: str) -> str:
+    """A name that may become a folder or a file; raises DatasetError for any other."""
+    if not _NAME.fullmatch(name):
+        raise DatasetError(f"{what} {name!r}: expected letters, digits, dot, dash, underscore")
+    return name
+
+
+def keys_of(within: Path) -> dict[str, Any]:
+    """What a file's way within its dataset says of its rows: `key=value` folders, shard number."""
+    keys: dict[str, Any] = {}
+    for part in within.parts[:-1]:
+        key, sign, value = part.partition("=")
+        if sign:
+            keys[key] = value
+    if found := re.fullmatch(r"shard-(\d+)", within.stem):
+        keys["shard"] = int(found[1])
+    return keys
 
 
 def locate(path: str | Path) -> Path:
@@ -68,23 +96,42 @@ def file_hash(path: Path) -> str:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A local temporary name that becomes `path` when the block ends well."""
+    """A local temporary name that becomes `path` when the block ends well.
+
+    Raises DatasetError where nothing can be written: no permission, no room, no folder.
+    """
     if is_remote(path):
         with tempfile.TemporaryDirectory(prefix="relevance-") as folder:
             temporary = Path(folder) / path.name
             yield temporary
             filesystem(path).pipe_file(cast(Any, path).path, temporary.read_bytes())
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
     owner = f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}"
     temporary = path.parent / f".{path.name}.{owner}.tmp"
     try:
-        yield temporary
-        with temporary.open("rb+") as stream:
-            os.fsync(stream.fileno())  # the name must not outlive the bytes in a power cut
-        os.replace(temporary, path)
+        with writing(path, path.parent, temporary):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield temporary
+            with temporary.open("rb+") as stream:
+                os.fsync(stream.fileno())  # the name must not outlive the bytes in a power cut
+            os.replace(temporary, path)
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing(path: Path, *touched: Path) -> Iterator[None]:
+    """Turn an OSError about the `touched` files, or a full disk, into one line about `path`."""
+    try:
+        yield
+    except OSError as error:
+        about = str(error.filename or "")
+        mine = any(str(item) == about or item.is_relative_to(about or "?") for item in touched)
+        if not mine and error.errno not in _DISK:
+            raise
+        reason = error.strerror or str(error)
+        raise DatasetError(f"{path}: cannot be written ({reason})") from None
 
 
 def copy_file(source: Path, target: Path) -> None:
