@@ -11,6 +11,7 @@ import json
 import os
 import sys
 import time
+from typing import Any
 
 
 def main() -> None:
@@ -27,7 +28,9 @@ def main() -> None:
         answers.flush()
 
     # Older ones never replayed; nobody's time holds a replay.
-    bare = {"replay": False} if "replay" in inspect.signature(plan).parameters else {}
+    bare: dict[str, Any] = (
+        {"replay": False} if "replay" in inspect.signature(plan).parameters else {}
+    )
     warm_up()
     answer(package=os.path.realpath(relevance.__file__))
     for line in sys.stdin:
