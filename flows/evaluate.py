@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from prefect import flow, get_run_logger, task
-from prefect.artifacts import (
-    create_link_artifact,
-    create_markdown_artifact,
-    create_table_artifact,
-)
-from prefect.cache_policies import NO_CACHE
-
+from flows.head import leave_link, leave_page, leave_table, retried, say, stage
 from flows.parameters import (
     DatasetPath,
     Overrides,
@@ -22,34 +16,13 @@ from flows.parameters import (
     absolute,
     configured,
 )
-from flows.shards import process_pool, run_shards, worth_retrying
+from flows.shards import process_pool, run_shards
 
 if TYPE_CHECKING:
     from relevance.evaluation import EvaluationConfig
 
-_TASK: dict[str, Any] = {
-    "retries": 2,
-    "retry_delay_seconds": [1, 10],
-    "retry_condition_fn": worth_retrying,
-    "persist_result": False,
-    "cache_policy": NO_CACHE,
-}
 
-SPEED = """
-    select guide, search, beta, count(*) as tasks,
-        round(avg(solved_unguided::int), 4) as solved_unguided,
-        round(avg(solved_guided::int), 4) as solved_guided,
-        round(avg(seconds_unguided), 5) as seconds_unguided,
-        round(avg(seconds_guided), 5) as seconds_guided,
-        round(sum(seconds_unguided) / nullif(sum(seconds_guided), 0), 3) as speed_up,
-        round(avg(nlps_unguided), 2) as nlps_unguided,
-        round(avg(nlps_guided), 2) as nlps_guided
-    from evaluations where checkpoint_id = '{checkpoint_id}'
-    group by all order by all
-"""
-
-
-@task(name="evaluate-shard", **_TASK)
+@retried(name="evaluate-shard")
 def evaluate_one(root: str, checkpoint: str, config: EvaluationConfig, shard: int) -> int:
     """Score the labelled objects of one shard, then rerun the planner on its tasks."""
     from relevance import evaluation
@@ -58,7 +31,7 @@ def evaluate_one(root: str, checkpoint: str, config: EvaluationConfig, shard: in
     return evaluation.evaluate(root, checkpoint, config, shards=[shard])
 
 
-@task(name="report", **_TASK)
+@retried(name="report")
 def report_one(root: str, checkpoint_id: str) -> str:
     """Write the report; its path."""
     from relevance.report import page
@@ -66,12 +39,7 @@ def report_one(root: str, checkpoint_id: str) -> str:
     return str(page.build(root, checkpoint_id=checkpoint_id))
 
 
-@flow(
-    name="evaluate",
-    flow_run_name="evaluate-{preset}",
-    task_runner=process_pool(),
-    persist_result=False,
-)
+@stage(process_pool())
 def evaluate(
     dataset: DatasetPath = "data/demo",
     checkpoint: str | None = None,
@@ -89,8 +57,9 @@ def evaluate(
         max_workers: Processes that work at a time; the number of cores when empty. Times are of
             one core each; for the steadiest ones take 1.
     """
-    from relevance.evaluation import EvaluationConfig
-    from relevance.store import Dataset, sql
+    from relevance.evaluation import EvaluationConfig, load_scorer, speed_table
+    from relevance.store import Dataset
+    from relevance.training.checkpoints import newest_checkpoint
 
     root = absolute(dataset)
     there = Dataset.open(root)
@@ -99,6 +68,7 @@ def evaluate(
     shards = there.shards(config.split)
     if not shards:
         raise ParameterError(f"{root}: no {config.split} scenes, expected `generate` first")
+    checkpoint_id = load_scorer(path).checkpoint_id  # a file may have any name
     run_shards(
         evaluate_one,
         {
@@ -113,33 +83,23 @@ def evaluate(
         stage="evaluate",
         max_workers=max_workers,
     )
-    report = Path(report_one(str(root), path.stem))
-    columns, rows = sql(root, SPEED.format(checkpoint_id=path.stem))
-    speed = [dict(zip(columns, row, strict=True)) for row in rows]
-    create_table_artifact(speed, key="evaluation", description=f"Guided planning, `{path.stem}`")
-    create_link_artifact(report.as_uri(), key="report", link_text="Report", description="Report")
-    create_markdown_artifact(
-        f"# Evaluation of {path.stem}\n\n{markdown(columns, rows)}\n\n"
+    report = Path(report_one(str(root), checkpoint_id))
+    speed = speed_table(Dataset.open(root), checkpoint_id)
+    leave_table("evaluation", speed, f"Guided planning, `{checkpoint_id}`")
+    leave_link("report", report, "Report")
+    leave_page(
+        "evaluation-summary",
+        f"# Evaluation of {checkpoint_id}\n\n{markdown(speed)}\n\n"
         f"Report: [{report}]({report.as_uri()})\n",
-        key="evaluation-summary",
-        description="What guidance saves, and the link to the report",
+        "What guidance saves, and the link to the report",
     )
-    get_run_logger().info("evaluate: report %s", report)
+    say("evaluate: report %s", report)
     return str(report)
 
 
-def newest_checkpoint(root: Path) -> Path:
-    """The checkpoint that was made last; raises ParameterError when there is none."""
-    from relevance.store import Dataset
-
-    rows = Dataset.open(root).read_rows("checkpoints")
+def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A Markdown table; nothing for no rows."""
     if not rows:
-        raise ParameterError(f"{root}: no checkpoints there, expected `train` first")
-    last = max(rows, key=lambda row: (row["created"], row["checkpoint_id"]))
-    return root / last["path"]
-
-
-def markdown(columns: list[str], rows: list[tuple[Any, ...]]) -> str:
-    """A Markdown table."""
-    lines = [columns, ["---"] * len(columns), *rows]
+        return ""
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(row.values() for row in rows)]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)

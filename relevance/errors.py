@@ -9,3 +9,7 @@ class RelevanceError(ValueError):
     The command line prints that line and exits with 2. Anything else that is raised is a fault
     of this project.
     """
+
+
+class RelevanceWarning(UserWarning):
+    """Input that is used although its answer may mislead; one line that says why."""

@@ -16,13 +16,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 from relevance.planner import logic
 from relevance.planner.problem import Counts, Motion, Problem, Seconds
+from relevance.registry import Registry
 from relevance.scene import (
     Action,
     Box,
@@ -88,7 +89,7 @@ class PlanResult:
     """What the planner found, and what it cost to find it."""
 
     goal: Goal
-    status: Literal["solved", "infeasible", "limit"]
+    status: Literal["solved", "infeasible", "limit", "refused"]
     reason: str = ""
     actions: tuple[Action, ...] = ()
     moved: tuple[str, ...] = ()
@@ -107,6 +108,8 @@ class PlanResult:
     """Deepest penetration at the sub-steps of the dense check, m."""
     phases: tuple[Phase, ...] = ()
     seconds: Seconds
+    replay: Any = None
+    """The verdict of the replay in the simulator; None where the plan was not replayed."""
 
 
 class _Limit(Exception):
@@ -120,13 +123,38 @@ def plan(
     config: PlannerConfig = PlannerConfig(),
     guide: Guide | None = None,
     movable: Collection[str] | None = None,
+    replay: bool = False,
 ) -> PlanResult:
     """Find the shortest sequence of picks and places, and its motion, that makes the goal true.
 
-    movable: the objects that may be moved (None: all). Raises SceneError for an unknown
+    movable: the objects that may be moved (None: all). replay: whether the simulator has to
+    confirm the plan; this is not counted in its seconds. Raises SceneError for an unknown
     predicate or object. A goal that cannot be reached is a result with a reason.
     """
-    goal = scene.goal(goal)
+    found = _plan(scene, scene.goal(goal), config, guide, movable)
+    return replayed(scene, found) if replay else found
+
+
+def replayed(scene: Scene, result: PlanResult) -> PlanResult:
+    """The result with the replay's verdict; a plan that the replay does not confirm is refused."""
+    if result.status != "solved":
+        return result
+    from relevance.simulation import replay
+
+    verdict = replay(scene, result.goal, result.phases)
+    if verdict.ok:
+        return replace(result, replay=verdict)
+    reason = f"the replay does not confirm the plan: {verdict.reason}"
+    return replace(result, status="refused", reason=reason, replay=verdict)
+
+
+def _plan(
+    scene: Scene,
+    goal: Goal,
+    config: PlannerConfig,
+    guide: Guide | None,
+    movable: Collection[str] | None,
+) -> PlanResult:
     everything = frozenset(scene.names if movable is None else movable)
     for name in everything - set(scene.names):
         raise SceneError(f"movable: no object {name!r}, expected some of {', '.join(scene.names)}")
@@ -170,7 +198,22 @@ def warm_up() -> None:
         Box(name=name, size=(0.05, 0.05, 0.05), position=(0.0, y, 0.025), color=color)
         for name, y in (("a", 0.2), ("b", 0.0))
     ]
-    plan(Scene(objects=tuple(boxes)), "on(a, b)")
+    plan(Scene(objects=tuple(boxes)), "on(a, b)", replay=False)
+
+
+class Ours:
+    """This planner, as the registry has it."""
+
+    Config = PlannerConfig
+    plan = staticmethod(plan)
+    warm_up = staticmethod(warm_up)
+
+    def require(self) -> None:
+        """It always can."""
+
+
+PLANNERS: Registry[Any] = Registry("planner")
+PLANNERS.register("ours", Ours())
 
 
 def _ordered(guide: Guide | None) -> bool:

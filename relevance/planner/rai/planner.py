@@ -35,7 +35,7 @@ from relevance.errors import RelevanceError
 from relevance.planner.kinematics import ARM, HOME, LINKS, panda
 from relevance.planner.path import SPEED, STEP
 from relevance.planner.problem import Counts, Seconds
-from relevance.planner.search import Guide, PlanResult, rounds
+from relevance.planner.search import PLANNERS, Guide, PlanResult, replayed, rounds
 from relevance.scene import (
     Action,
     Box,
@@ -507,3 +507,23 @@ def _turned(yaw: float) -> tuple[float, float, float, float]:
 
 def _row(values) -> str:
     return ", ".join(f"{value:.9f}" for value in values)
+
+
+class Rai:
+    """rai, as the registry has it."""
+
+    Config = RaiConfig
+    require = staticmethod(require_rai)
+
+    def warm_up(self) -> None:
+        """Nothing: it is another process."""
+
+    def plan(
+        self, scene: Scene, goal: Goal | str, *, replay: bool = True, **more: Any
+    ) -> PlanResult:
+        """As `plan_rai`, and replayed."""
+        found = plan_rai(scene, goal, **more)
+        return replayed(scene, found) if replay else found
+
+
+PLANNERS.register("rai", Rai())
