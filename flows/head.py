@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -33,7 +34,7 @@ R = TypeVar("R")
 
 
 class NoServer(RelevanceError):
-    """The Prefect server that was named does not answer."""
+    """The Prefect server that was named does not answer, or none can be started."""
 
 
 class Stage(Flow[P, R]):
@@ -46,16 +47,32 @@ class Stage(Flow[P, R]):
 
 
 def find_server() -> None:
-    """Raises NoServer when PREFECT_API_URL names a server that does not answer."""
-    url = get_current_settings().api.url
+    """Raises NoServer when PREFECT_API_URL names a server that does not answer.
+
+    Without a name a flow starts a server of its own, and that needs a home.
+    """
+    settings = get_current_settings()
+    url = settings.api.url
     if not url:
-        return  # then a flow starts one of its own
+        _writable(settings.home)
+        return
     try:
         httpx.get(f"{url}/health", timeout=30)
     except (httpx.TransportError, httpx.InvalidURL) as error:
         raise NoServer(
             f"PREFECT_API_URL {url}: no Prefect server answers ({error}); start one with "
             "`prefect server start`, or unset it"
+        ) from None
+
+
+def _writable(home: Path) -> None:
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=home):
+            return
+    except OSError as error:
+        raise NoServer(
+            f"PREFECT_HOME {home}: {error.strerror}, expected a folder that can be written"
         ) from None
 
 
