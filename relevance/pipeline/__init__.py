@@ -12,8 +12,8 @@ from relevance.pipeline.settings import (
     describe,
     load_config,
     prepare,
+    shard_specs,
     shards_of,
-    work,
 )
 from relevance.pipeline.shards import (
     ATTEMPTS,
@@ -24,6 +24,7 @@ from relevance.pipeline.shards import (
     labelled,
 )
 from relevance.pipeline.upkeep import finish, integrity, repair
+from relevance.pipeline.work import Job, Work, labels_work, missing, scenes_work
 
 __all__ = [
     "ATTEMPTS",
@@ -31,9 +32,11 @@ __all__ = [
     "Counts",
     "DatasetConfig",
     "Estimate",
+    "Job",
     "Quantities",
     "ShardReport",
     "ShardSpec",
+    "Work",
     "actual",
     "append",
     "describe",
@@ -45,10 +48,13 @@ __all__ = [
     "integrity",
     "label_shard",
     "labelled",
+    "labels_work",
     "load_config",
     "merge",
+    "missing",
     "prepare",
     "repair",
+    "scenes_work",
+    "shard_specs",
     "shards_of",
-    "work",
 ]
