@@ -1,5 +1,6 @@
 """Making a dataset: its settings and shards, how they are made, kept, merged and estimated."""
 
+from relevance.pipeline.doing import Made, do
 from relevance.pipeline.estimating import Estimate, Quantities, actual, estimate
 from relevance.pipeline.merging import merge
 from relevance.pipeline.settings import (
@@ -33,6 +34,7 @@ __all__ = [
     "DatasetConfig",
     "Estimate",
     "Job",
+    "Made",
     "Quantities",
     "ShardReport",
     "ShardSpec",
@@ -40,6 +42,7 @@ __all__ = [
     "actual",
     "append",
     "describe",
+    "do",
     "draw",
     "estimate",
     "finish",
