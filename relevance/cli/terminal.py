@@ -57,7 +57,7 @@ def distinct(columns: Sequence[str]) -> list[str]:
     names: list[str] = []
     for column in columns:
         numbered = (f"{column}_{number}" for number in itertools.count(1))
-        taken = {*names, *(columns if column in names else ())}
+        taken = {*names, *(columns if column in names else ())}  # `a_1` may be a name itself
         names.append(next(n for n in itertools.chain([column], numbered) if n not in taken))
     return names
 
