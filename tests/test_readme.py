@@ -152,11 +152,11 @@ def _filled(text: str, project: Path) -> str:
 
 
 def _run(arguments: list[str], project: Path, where: str) -> None:
-    path = f"{Path(sys.executable).parent}:{ROOT}"
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     done = subprocess.run(
         arguments,
         cwd=project,
-        env=os.environ | {"PATH": f"{path}:/usr/bin:/bin", "PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PATH": path, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         timeout=600,
