@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -68,7 +69,7 @@ def evaluate(
     shards = there.shards(config.split)
     if not shards:
         raise ParameterError(f"{root}: no {config.split} scenes, expected `generate` first")
-    checkpoint_id = load_scorer(path).checkpoint_id  # a file may have any name
+    checkpoint_id = load_scorer(path, into=there).checkpoint_id  # whatever its file is called
     run_shards(
         evaluate_one,
         {
@@ -84,7 +85,7 @@ def evaluate(
         max_workers=max_workers,
     )
     report = Path(report_one(str(root), checkpoint_id))
-    speed = speed_table(Dataset.open(root), checkpoint_id)
+    speed = [{k: _short(v) for k, v in row.items()} for row in speed_table(there, checkpoint_id)]
     leave_table("evaluation", speed, f"Guided planning, `{checkpoint_id}`")
     leave_link("report", report, "Report")
     leave_page(
@@ -95,6 +96,13 @@ def evaluate(
     )
     say("evaluate: report %s", report)
     return str(report)
+
+
+def _short(value: Any) -> Any:
+    """Four digits, and nothing for what is not a number: JSON has no nan."""
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.4g}") if math.isfinite(value) else None
 
 
 def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
