@@ -114,7 +114,7 @@ def test_the_other_defaults_come_from_the_preset(capsys: pytest.CaptureFixture[s
         (["plan", "none.jsonl"], "none.jsonl: cannot be read"),
         (["plan", "none.jsonl", "--limit", "0"], "--limit 0: expected at least 1"),
         (["plan", "none.jsonl", "--guide", "prune"], "--guide and --checkpoint go together"),
-        (["paln"], "unknown command 'paln', expected one of generate, label"),
+        (["paln"], "unknown command 'paln', expected one of estimate, generate, label"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(

@@ -108,9 +108,12 @@ def _parse(name: str, run: Callable[..., int], about: str, rest: list[str]) -> C
 
 def _first(page: str) -> str:
     """What a page of tyro says first, without its frame."""
-    lines = [line.strip(" │╭╮╰╯") for line in page.splitlines()]
-    body = list(itertools.dropwhile(lambda line: not line or "──" in line, lines))
-    said = itertools.takewhile(lambda line: line and "──" not in line, body)
+
+    def frame(line: str) -> bool:
+        return not line or "──" in line or "---" in line  # as the encoding of stderr allows
+
+    lines = [line.strip(" │╭╮╰╯|+") for line in page.splitlines()]
+    said = itertools.takewhile(lambda line: not frame(line), itertools.dropwhile(frame, lines))
     return " ".join(" ".join(said).split())
 
 
