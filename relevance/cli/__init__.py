@@ -107,13 +107,10 @@ def _parse(name: str, run: Callable[..., int], about: str, rest: list[str]) -> C
 
 
 def _first(page: str) -> str:
-    """What a page of tyro says first, without its frame."""
-
-    def frame(line: str) -> bool:
-        return not line or "──" in line or "---" in line  # as the encoding of stderr allows
-
-    lines = [line.strip(" │╭╮╰╯|+") for line in page.splitlines()]
-    said = itertools.takewhile(lambda line: not frame(line), itertools.dropwhile(frame, lines))
+    """What a page of tyro says first: between its first two rules, drawn as stderr allows."""
+    lines = [line.strip(" │╭╮╰╯") for line in page.splitlines()]
+    rules = [number for number, line in enumerate(lines) if "──" in line or "---" in line]
+    said = lines[rules[0] + 1 : rules[1]] if len(rules) > 1 else lines
     return " ".join(" ".join(said).split())
 
 
