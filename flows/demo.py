@@ -10,6 +10,7 @@ from typing import Any
 
 from flows.evaluate import evaluate
 from flows.generate import generate
+from flows.head import find_server
 from flows.label import label
 from flows.parameters import Overrides, Preset, absolute
 from flows.train import train
@@ -36,6 +37,7 @@ def run(
     max_workers: int | None = None,
 ) -> Demo:
     """Generate, label, train, evaluate and report; what was finished before is not repeated."""
+    find_server()
     root, seconds = str(absolute(dataset)), dict[str, float]()
 
     def stage(flow: Callable[..., Any], **parameters: Any) -> Any:

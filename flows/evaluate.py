@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from prefect import flow, get_run_logger, task
-from prefect.artifacts import (
-    create_link_artifact,
-    create_markdown_artifact,
-    create_table_artifact,
-)
-from prefect.cache_policies import NO_CACHE
-
+from flows.head import leave_link, leave_page, leave_table, retried, say, stage
 from flows.parameters import (
     DatasetPath,
     Overrides,
@@ -23,21 +17,13 @@ from flows.parameters import (
     absolute,
     configured,
 )
-from flows.shards import process_pool, run_shards, worth_retrying
+from flows.shards import process_pool, run_shards
 
 if TYPE_CHECKING:
     from relevance.evaluation import EvaluationConfig
 
-_TASK: dict[str, Any] = {
-    "retries": 2,
-    "retry_delay_seconds": [1, 10],
-    "retry_condition_fn": worth_retrying,
-    "persist_result": False,
-    "cache_policy": NO_CACHE,
-}
 
-
-@task(name="evaluate-shard", **_TASK)
+@retried(name="evaluate-shard")
 def evaluate_one(root: str, checkpoint: str, config: EvaluationConfig, shard: int) -> int:
     """Score the labelled objects of one shard, then rerun the planner on its tasks."""
     from relevance import evaluation
@@ -46,7 +32,7 @@ def evaluate_one(root: str, checkpoint: str, config: EvaluationConfig, shard: in
     return evaluation.evaluate(root, checkpoint, config, shards=[shard])
 
 
-@task(name="report", **_TASK)
+@retried(name="report")
 def report_one(root: str, checkpoint_id: str) -> str:
     """Write the report; its path."""
     from relevance.report import page
@@ -54,12 +40,7 @@ def report_one(root: str, checkpoint_id: str) -> str:
     return str(page.build(root, checkpoint_id=checkpoint_id))
 
 
-@flow(
-    name="evaluate",
-    flow_run_name="evaluate-{preset}",
-    task_runner=process_pool(),
-    persist_result=False,
-)
+@stage(process_pool())
 def evaluate(
     dataset: DatasetPath = "data/demo",
     checkpoint: str | None = None,
@@ -79,6 +60,7 @@ def evaluate(
     """
     from relevance.evaluation import EvaluationConfig, load_scorer, speed_table
     from relevance.store import Dataset
+    from relevance.training.checkpoints import newest_checkpoint
 
     root = absolute(dataset)
     there = Dataset.open(root)
@@ -104,29 +86,16 @@ def evaluate(
     )
     report = Path(report_one(str(root), checkpoint_id))
     speed = [{k: _short(v) for k, v in row.items()} for row in speed_table(there, checkpoint_id)]
-    create_table_artifact(
-        speed, key="evaluation", description=f"Guided planning, `{checkpoint_id}`"
-    )
-    create_link_artifact(report.as_uri(), key="report", link_text="Report", description="Report")
-    create_markdown_artifact(
+    leave_table("evaluation", speed, f"Guided planning, `{checkpoint_id}`")
+    leave_link("report", report, "Report")
+    leave_page(
+        "evaluation-summary",
         f"# Evaluation of {checkpoint_id}\n\n{markdown(speed)}\n\n"
         f"Report: [{report}]({report.as_uri()})\n",
-        key="evaluation-summary",
-        description="What guidance saves, and the link to the report",
+        "What guidance saves, and the link to the report",
     )
-    get_run_logger().info("evaluate: report %s", report)
+    say("evaluate: report %s", report)
     return str(report)
-
-
-def newest_checkpoint(root: Path) -> Path:
-    """The checkpoint that was made last; raises ParameterError when there is none."""
-    from relevance.store import Dataset
-
-    rows = Dataset.open(root).read_rows("checkpoints")
-    if not rows:
-        raise ParameterError(f"{root}: no checkpoints there, expected `train` first")
-    last = max(rows, key=lambda row: (row["created"], row["checkpoint_id"]))
-    return root / last["path"]
 
 
 def _short(value: Any) -> Any:
@@ -136,8 +105,9 @@ def _short(value: Any) -> Any:
     return float(f"{value:.4g}") if math.isfinite(value) else None
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
-    """A Markdown table."""
-    columns = list(rows[0]) if rows else []
-    lines = [columns, ["---"] * len(columns), *(list(row.values()) for row in rows)]
+def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A Markdown table; nothing for no rows."""
+    if not rows:
+        return ""
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(row.values() for row in rows)]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-from prefect import flow, get_run_logger, task
-from prefect.artifacts import create_table_artifact
-from prefect.cache_policies import NO_CACHE
-
+from flows.head import announce, leave_table, retried, say, stage
 from flows.parameters import (
     Cluster,
     DatasetPath,
@@ -17,33 +15,19 @@ from flows.parameters import (
     absolute,
     configured,
 )
-from flows.shards import announce, process_pool, run_shards, worth_retrying
+from flows.shards import process_pool, run_work
 
 if TYPE_CHECKING:
-    from relevance.pipeline import DatasetConfig, ShardReport, ShardSpec
+    from relevance.pipeline import Job, ShardReport
 
 
-@task(
-    name="generate-shard",
-    retries=2,
-    retry_delay_seconds=[1, 10],
-    retry_condition_fn=worth_retrying,
-    persist_result=False,
-    cache_policy=NO_CACHE,
-)
-def generate_one(root: str, config: DatasetConfig, spec: ShardSpec) -> ShardReport:
+@retried(name="generate-shard")
+def generate_one(job: Job) -> ShardReport:
     """Sample, render and write one shard."""
-    from relevance.pipeline import generate_shard
-
-    return generate_shard(root, config, spec)
+    return job.run()
 
 
-@flow(
-    name="generate",
-    flow_run_name="generate-{preset}",
-    task_runner=process_pool(),
-    persist_result=False,
-)
+@stage(process_pool())
 def generate(
     dataset: DatasetPath = "data/demo",
     preset: Preset = "demo",
@@ -62,40 +46,27 @@ def generate(
         cluster: Address of a Dask scheduler whose workers make the shards instead, each of which
             reaches the dataset (and Prefect's server).
     """
-    from relevance.pipeline import DatasetConfig, finish, generated, prepare
+    from relevance.pipeline import DatasetConfig, scenes_work, shards_of
     from relevance.store import Dataset
 
     root = absolute(dataset)
-    config = configured(DatasetConfig, preset, overrides)
-    specs = prepare(root, config, scenes_only=True)
-    there = Dataset.open(root)
-    jobs = {
-        f"{spec.split}-{spec.shard:06d}": {"root": str(root), "config": config, "spec": spec}
-        for spec in specs
-        if not generated(there, spec)
-    }
-    done = len(specs) - len(jobs)
-    reports = run_shards(
-        generate_one, jobs, stage="generate", done=done, max_workers=max_workers, cluster=cluster
-    )
-    finish(root)
+    work = scenes_work(root, configured(DatasetConfig, preset, overrides))
+    made = run_work(generate_one, work, stage="generate", max_workers=max_workers, cluster=cluster)
+    specs = shards_of(Dataset.open(root))
+    written = {name: report for name, report in made.reports.items() if not report.skipped}
+    shards = Counter((spec.split, spec.family) for spec in specs)
+    now = Counter((report.spec.split, report.spec.family) for report in written.values())
     rows = [
         {
             "split": split,
             "family": family,
-            "shards": len(mine),
-            "scenes": sum(spec.count for spec in mine),
-            "made now": sum(
-                f"{spec.split}-{spec.shard:06d}" in reports
-                and not reports[f"{spec.split}-{spec.shard:06d}"].skipped
-                for spec in mine
-            ),
+            "shards": count,
+            "scenes": sum(s.count for s in specs if (s.split, s.family) == (split, family)),
+            "made now": now[split, family],
         }
-        for split, family in dict.fromkeys((spec.split, spec.family) for spec in specs)
-        for mine in [[s for s in specs if (s.split, s.family) == (split, family)]]
+        for (split, family), count in shards.items()
     ]
-    create_table_artifact(rows, key="generate-shards", description=f"Scenes of `{root}`")
-    written = [name for name, report in reports.items() if not report.skipped]
+    leave_table("generate-shards", rows, f"Scenes of `{root}`")
     announce(root, "scenes", written)
-    get_run_logger().info("generate: %d shards made, %d were there", len(written), done)
+    say("generate: %s", made.summary)
     return {"dataset": str(root), "shards": len(specs), "written": len(written)}

@@ -11,6 +11,7 @@ import functools
 import os
 import threading
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from prefect.plugins import register_hook
@@ -18,13 +19,22 @@ from prefect.plugins import register_hook
 if TYPE_CHECKING:
     from prefect.plugins import HookContext
 
-FLOWS = ("generate", "label", "train", "evaluate", "retrain")
 PREFECT_PLUGIN_API_REQUIRES = ">=0.1,<1"
+
+
+@functools.cache
+def deployments() -> tuple[str, ...]:
+    """The names in the project's prefect.yaml; none outside the project folder."""
+    import yaml
+
+    file = Path(__file__).parent.parent / "prefect.yaml"
+    found = yaml.safe_load(file.read_text("utf-8"))["deployments"] if file.is_file() else []
+    return tuple(deployment["name"] for deployment in found)
 
 
 def full_name(name: str) -> str:
     """`generate` -> `generate/generate` for our flows; every other name stays as it is."""
-    return f"{name}/{name}" if name in FLOWS else name
+    return f"{name}/{name}" if name in deployments() else name
 
 
 def wrap_read_deployment(client: Any) -> None:

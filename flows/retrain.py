@@ -8,20 +8,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from prefect import flow, get_run_logger
-
 from flows.evaluate import evaluate
+from flows.head import say, stage
 from flows.parameters import DatasetPath, Overrides, Preset, Workers, absolute, configured
-from flows.shards import one_by_one
 from flows.train import train
 
 
-@flow(
-    name="retrain",
-    flow_run_name="retrain-{preset}",
-    task_runner=one_by_one(),
-    persist_result=False,
-)
+@stage()
 def retrain(
     dataset: DatasetPath = "data/demo",
     preset: Preset = "demo",
@@ -56,7 +49,7 @@ def retrain(
     ]
     evaluated = {name for (name,) in sql(root, "select distinct checkpoint_id from evaluations")[1]}
     if evaluated.intersection(same) and not force:
-        get_run_logger().info("retrain: nothing new since %s", same[0])
+        say("retrain: nothing new since %s", same[0])
         return {"checkpoint": same[0], "report": None, "new": False}
     checkpoint = train(dataset=str(root), preset=preset, overrides=overrides)
     report = evaluate(

@@ -1,43 +1,39 @@
-"""One task per shard: the worker pool, what happens when it breaks, progress and the event.
+"""One task per shard: the worker pool, and the progress.
 
 The shard files say what is finished, so a flow submits only what is missing and a second run
-after any kind of death goes on where the first one stopped.
+after any kind of death goes on where the first one stopped. What a failed shard or a dead worker
+means is `relevance.workers`' to say, for the command line too.
 """
 
 from __future__ import annotations
 
 import atexit
+import functools
 import itertools
 import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
-from multiprocessing import connection, parent_process
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from uuid import UUID
 
 from prefect import Task, get_run_logger
 from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.context import FlowRunContext
-from prefect.events import emit_event
 from prefect.futures import PrefectFuture, as_completed
 from prefect.server.api.server import SubprocessASGIServer
 from prefect.settings import PREFECT_API_URL, get_current_settings, temporary_settings
 from prefect.task_runners import ProcessPoolTaskRunner, TaskRunner, ThreadPoolTaskRunner
 
-EVENT = "shards.written"
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+from relevance.pipeline import do
+from relevance.workers import ShardsFailed, gather, prepare_worker
 
-MOST_FAILURES = 5
-"""A flow stops handing out shards once this many have failed for good."""
-MOST_POOLS = 3
-"""How often a pool whose worker died (out of memory, say) is replaced."""
+if TYPE_CHECKING:
+    from relevance.pipeline import Made, Work
 
 MOST_FLYING = 256
 """Workers of a cluster that are kept busy: four shards each are handed out ahead."""
@@ -45,28 +41,6 @@ MOST_FLYING = 256
 Listener = Callable[[str, int, int], None]
 listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 """Hears (stage, done, total) in the flow's own process; the command line draws bars with it."""
-
-
-class ShardsFailed(RuntimeError):
-    """Some shards could not be made; the finished ones stay."""
-
-
-def prepare_worker() -> None:
-    """Run first in each worker process: one thread for arrays, and no life without the flow.
-
-    A worker holds both ends of its queue, so it would wait for ever when its flow is killed.
-    """
-    for name in THREADS:
-        os.environ.setdefault(name, "1")
-    parent = parent_process()
-    if parent is None:
-        return
-
-    def watch(sentinel: int = parent.sentinel) -> None:
-        connection.wait([sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
 
 
 def process_pool(max_workers: int | None = None) -> TaskRunner[Any]:
@@ -82,11 +56,6 @@ def dask_cluster(address: str) -> TaskRunner[Any]:
     except ImportError:
         raise ShardsFailed("a Dask cluster needs prefect-dask: install relevance[dask]") from None
     return DaskTaskRunner(address=address)
-
-
-def worth_retrying(task: Task[Any, Any], run: Any, state: Any) -> bool:
-    """Whether another try could help: bad input (a ValueError) stays bad."""
-    return not isinstance(state.result(raise_on_failure=False), ValueError)
 
 
 def one_by_one() -> TaskRunner[Any]:
@@ -158,70 +127,70 @@ def run_shards(
 ) -> dict[str, Any]:
     """Run the task once a job (name -> parameters), in any order; results by name.
 
-    `done` shards were finished before and count as progress. A shard that fails does not stop
-    the others; raises ShardsFailed at the end. A dead worker process costs a new pool and the
-    shards that were under way.
+    `done` shards were finished before and count as progress. See `relevance.workers.gather` for
+    those that fail.
     """
-    results: dict[str, Any] = {}
-    failures: dict[str, BaseException] = {}
+    outcomes = functools.partial(
+        _outcomes, task=task, parameters=dict, max_workers=max_workers, cluster=cluster
+    )
     with progress(stage, done + len(jobs), done=done) as advance:
-        for pool in itertools.count(1):
-            left = {
-                name: parameters
-                for name, parameters in jobs.items()
-                if name not in results and name not in failures
-            }
-            if not left or len(failures) >= MOST_FAILURES:
-                break
-            try:
-                with _runner(max_workers, cluster) as runner:
-                    under_way = max_workers or (MOST_FLYING if cluster else None)
-                    for name, outcome in _outcomes(runner, task, left, under_way):
-                        if isinstance(outcome, BaseException):
-                            failures[name] = outcome
-                            get_run_logger().error("%s: shard %s: %s", stage, name, outcome)
-                            if len(failures) >= MOST_FAILURES:
-                                break
-                        else:
-                            results[name] = outcome
-                            advance(done + len(results))
-            except BrokenProcessPool:
-                get_run_logger().warning("%s: a worker process died; pool %d", stage, pool)
-                if pool == MOST_POOLS:
-                    raise ShardsFailed(
-                        f"{stage}: worker processes died {pool} times (out of memory?) with "
-                        f"{len(results)} of {len(jobs)} shards made; try fewer max_workers"
-                    ) from None
-    if failures:
-        name, first = next(iter(failures.items()))
-        if isinstance(first, ValueError):
-            raise first
-        raise ShardsFailed(
-            f"{stage}: {len(failures)} of {len(jobs)} shards failed, {len(results)} were made; "
-            f"first {name}: {type(first).__name__}: {first}"
-        ) from first
-    return results
+        return gather(
+            stage,
+            jobs,
+            outcomes,
+            made=lambda made: advance(done + made),
+            warn=get_run_logger().warning,
+        )
+
+
+def run_work(
+    task: Task[Any, Any],
+    work: Work,
+    *,
+    stage: str,
+    max_workers: int | None,
+    cluster: str | None,
+) -> Made:
+    """Do what is left of a dataset, one task run a job (`job`, its only parameter)."""
+    outcomes = functools.partial(
+        _outcomes,
+        task=task,
+        parameters=lambda job: {"job": job},
+        max_workers=max_workers,
+        cluster=cluster,
+    )
+    total = work.done + len(work.jobs)
+    with progress(stage, total, done=work.done) as advance:
+        return do(
+            work,
+            outcomes,
+            made=lambda made: advance(work.done + made),
+            warn=get_run_logger().warning,
+        )
 
 
 def _outcomes(
-    runner: TaskRunner[Any],
+    jobs: Mapping[str, Any],
+    *,
     task: Task[Any, Any],
-    jobs: Mapping[str, dict[str, Any]],
+    parameters: Callable[[Any], dict[str, Any]],
     max_workers: int | None,
-) -> Iterator[tuple[str, Any]]:
+    cluster: str | None,
+) -> Generator[tuple[str, Any], None, None]:
     """(name, result or the exception) as they come; a bounded number is under way at a time."""
-    window = 4 * (max_workers or os.cpu_count() or 1)
+    window = 4 * (max_workers or (MOST_FLYING if cluster else os.cpu_count()) or 1)
     waiting, flying = iter(jobs.items()), dict[PrefectFuture[Any], str]()
-    while True:
-        for name, parameters in itertools.islice(waiting, window - len(flying)):
-            named = task.with_options(task_run_name=name)
-            flying[runner.submit(named, parameters)] = name
-        if not flying:
-            return
-        future = next(iter(as_completed(list(flying))))
-        name = flying.pop(future)
-        future.wait()
-        yield name, future.result(raise_on_failure=False)
+    with _runner(max_workers, cluster) as runner:
+        while True:
+            for name, job in itertools.islice(waiting, window - len(flying)):
+                named = task.with_options(task_run_name=name)
+                flying[runner.submit(named, parameters(job))] = name
+            if not flying:
+                return
+            future = next(iter(as_completed(list(flying))))
+            name = flying.pop(future)
+            future.wait()
+            yield name, future.result(raise_on_failure=False)
 
 
 @contextmanager
@@ -249,18 +218,3 @@ def progress(stage: str, total: int, *, done: int = 0) -> Iterator[Callable[[int
     if tell:
         tell(stage, done, total)
     yield advance
-
-
-def announce(dataset: Path, table: str, written: Iterable[str]) -> None:
-    """Emit `shards.written` with the names of the new shards; nothing when there are none."""
-    names = sorted(written)
-    if names:
-        emit_event(
-            EVENT,
-            resource={
-                "prefect.resource.id": f"relevance.dataset.{dataset}",
-                "prefect.resource.name": dataset.name,
-                "relevance.table": table,
-            },
-            payload={"dataset": str(dataset), "table": table, "shards": len(names)},
-        )

@@ -6,26 +6,16 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from prefect import flow, get_run_logger, task
-from prefect.artifacts import create_markdown_artifact, create_table_artifact
-from prefect.cache_policies import NO_CACHE
-
+from flows.head import leave_page, leave_table, retried, say, stage
 from flows.parameters import DatasetPath, Overrides, Preset, absolute, configured
-from flows.shards import one_by_one, progress, worth_retrying
+from flows.shards import progress
 
 if TYPE_CHECKING:
     from relevance.training import TrainConfig
 
 
-@task(
-    name="train-model",
-    # Another try goes on from the last saved state.
-    retries=2,
-    retry_delay_seconds=[1, 10],
-    retry_condition_fn=worth_retrying,
-    persist_result=False,
-    cache_policy=NO_CACHE,
-)
+# Another try goes on from the last saved state.
+@retried(name="train-model")
 def train_model(root: str, config: TrainConfig, out: str | None) -> str:
     """Train, or go on with what was begun; the path of the checkpoint."""
     from relevance import training
@@ -36,12 +26,7 @@ def train_model(root: str, config: TrainConfig, out: str | None) -> str:
     return str(path)
 
 
-@flow(
-    name="train",
-    flow_run_name="train-{preset}",
-    task_runner=one_by_one(),
-    persist_result=False,
-)
+@stage()
 def train(
     dataset: DatasetPath = "data/demo",
     preset: Preset = "demo",
@@ -67,16 +52,14 @@ def train(
     path = Path(train_model(str(root), config, str(absolute(out)) if out else None))
     [row] = [r for r in there.read_rows("checkpoints") if r["checkpoint_id"] == path.stem]
     metrics = json.loads(row["metrics"])
-    create_table_artifact(
-        table(metrics), key="train-metrics", description=f"Validation metrics of `{path.stem}`"
-    )
-    create_markdown_artifact(
+    leave_table("train-metrics", table(metrics), f"Validation metrics of `{row['checkpoint_id']}`")
+    leave_page(
+        "checkpoint",
         f"Checkpoint [{path.name}]({path.as_uri()}), {row['body']}, preset {row['preset']}, "
         f"trained in {row['train_seconds'] / 60:.1f} minutes on data {row['dataset_hash']}.",
-        key="checkpoint",
-        description="The trained model",
+        "The trained model",
     )
-    get_run_logger().info("train: %s", path)
+    say("train: %s", path)
     return str(path)
 
 

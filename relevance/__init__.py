@@ -10,11 +10,14 @@ Names are imported when first used, so that `import relevance` stays light.
 
 import hashlib
 import os
+import tempfile
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from relevance.errors import RelevanceError, RelevanceWarning
     from relevance.evaluation import load_guide
     from relevance.planner import Guide, PlannerConfig, PlanResult, plan
     from relevance.scene import Goal, Scene, SceneError, read_scenes
@@ -25,6 +28,27 @@ if TYPE_CHECKING:
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
+def _caches() -> Path:
+    """The folder of caches: the user's own, or one of this user's among the temporary files.
+
+    Where a home cannot be written (a service, a container) what is compiled is still kept, as long
+    as the machine runs, and by whoever looks at XDG_CACHE_HOME.
+    """
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    own = Path(tempfile.gettempdir()) / f"relevance-cache-{os.getuid()}"
+    for folder in (Path(home), own):
+        with suppress(OSError):
+            (folder / "relevance").mkdir(mode=0o700, parents=True, exist_ok=True)
+            # Among the temporary files somebody else may have been first.
+            if os.access(folder / "relevance", os.W_OK) and (
+                folder != own or folder.stat().st_uid == os.getuid()
+            ):
+                os.environ["XDG_CACHE_HOME"] = str(folder)
+                return folder
+    os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="relevance-cache-")
+    return Path(os.environ["XDG_CACHE_HOME"])
+
+
 def _kernel_cache(package: Path) -> Path:
     """Where compiled kernels are kept: one folder for each content of all their sources.
 
@@ -33,8 +57,7 @@ def _kernel_cache(package: Path) -> Path:
     """
     sources = (file.read_bytes() for file in sorted(package.rglob("*.py")))
     digest = hashlib.sha256(b"".join(text for text in sources if b"@njit" in text)).hexdigest()
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    return cache / "relevance" / f"kernels-{digest[:16]}"
+    return _caches() / "relevance" / f"kernels-{digest[:16]}"
 
 
 _cache = _kernel_cache(Path(__file__).parent)
@@ -48,6 +71,8 @@ _HOMES = {
     "Guide": "relevance.planner",
     "PlanResult": "relevance.planner",
     "PlannerConfig": "relevance.planner",
+    "RelevanceError": "relevance.errors",
+    "RelevanceWarning": "relevance.errors",
     "Scene": "relevance.scene",
     "SceneError": "relevance.scene",
     "load_guide": "relevance.evaluation",
@@ -61,6 +86,8 @@ __all__ = [
     "Guide",
     "PlanResult",
     "PlannerConfig",
+    "RelevanceError",
+    "RelevanceWarning",
     "Scene",
     "SceneError",
     "load_guide",

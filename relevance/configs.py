@@ -10,9 +10,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, TypeVar, dataclass_transform, get_type_hints
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from relevance.errors import RelevanceError
@@ -101,3 +101,40 @@ def _default(field: dataclasses.Field[Any]) -> Any:
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return dataclasses.MISSING
+
+
+def override(config: Any, changes: Mapping[str, Any], where: str = "") -> Any:
+    """A copy of a config with some settings replaced, by dotted name or nested mapping.
+
+    Raises ConfigError for an unknown setting or a value of the wrong type.
+    """
+    names = [field.name for field in dataclasses.fields(config) if field.init]
+    hints = get_type_hints(type(config), include_extras=True)
+    made: dict[str, Any] = {}
+    for key, value in changes.items():
+        name, dot, rest = key.partition(".")
+        if name not in names:
+            known = ", ".join(sorted(names))
+            raise ConfigError(f"{where}{name}: unknown setting, expected one of {known}")
+        current = made.get(name, getattr(config, name))
+        if dot:
+            value = {rest: value}
+        if dataclasses.is_dataclass(current) and isinstance(value, Mapping):
+            made[name] = override(current, value, f"{where}{name}.")
+        elif isinstance(current, Mapping) and dot:
+            made[name] = _checked(hints[name], {**current, **value}, f"{where}{name}")
+        elif dot:
+            raise ConfigError(f"{where}{key}: {where}{name} has no settings of its own")
+        else:
+            made[name] = _checked(hints[name], value, f"{where}{name}")
+    return dataclasses.replace(config, **made)
+
+
+def _checked(hint: Any, value: Any, where: str) -> Any:
+    try:
+        return TypeAdapter(hint).validate_python(value)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        inner = "".join(f".{part}" for part in first["loc"])
+        message = first["msg"].removeprefix("Value error, ")
+        raise ConfigError(f"{where}{inner}: {message} (found {first['input']!r})") from None

@@ -19,6 +19,7 @@ ORDER = (
     "hashing",
     "configs",
     "counters",
+    "workers",
     "robot",
     "scene",
     "store",

@@ -5,11 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -98,11 +95,26 @@ def test_the_other_defaults_come_from_the_preset(capsys: pytest.CaptureFixture[s
         (["train", "none", "--steps", "0"], "TrainConfig.steps is 0, expected at least 1"),
         (["generate", "new", "--preset", "huge"], "--preset huge: expected one of smoke, demo"),
         (["generate", "new", "--preset", "smoke", "--workers", "0"], "--workers 0: expected"),
+        (["generate", "new", "--nonsense"], "Unrecognized options: --nonsense; see relevance gen"),
+        (["generate"], "DATASET Folder of the dataset"),
+        (["generate", "/dev/null/new", "--preset", "smoke"], "/dev/null/new: Not a directory"),
+        (["label", "none", "--workers", "-2"], "--workers -2: expected 1 to 1024"),
+        (["label", "none", "--goals-per-scene", "0"], "--goals-per-scene 0: expected at least 1"),
+        (["label", "none", "--goals-seed", "-1"], "--goals-seed -1: expected at least 0"),
+        (["repair", "none", "--workers", "0"], "--workers 0: expected"),
+        (["demo", "--workers", "0"], "--workers 0: expected"),
+        (["dashboard", "none", "--port", "99999"], "--port 99999: expected 1 to 65535"),
+        (["plan", "none.jsonl", "--beta", "nan"], "--beta nan: expected a finite number"),
+        (["plan", "none.jsonl", "--seconds", "-1"], "--seconds -1.0: expected at least 0.001"),
+        (["plan", "none.jsonl", "--max-actions", "0"], "--max-actions 0: expected at least 2"),
+        (["plan", "none.jsonl", "--guide", "gues"], "--guide gues: expected one of none, prune"),
+        (["plan", "none.jsonl", "--planner", "his"], "--planner his: expected one of ours, rai"),
+        (["bench", "dataset", "--kills", "0"], "--kills 0: expected at least 1"),
         (["generate", "new", "--replay-share", "2"], "DatasetConfig.replay_share = 2.0: expected"),
         (["plan", "none.jsonl"], "none.jsonl: cannot be read"),
         (["plan", "none.jsonl", "--limit", "0"], "--limit 0: expected at least 1"),
         (["plan", "none.jsonl", "--guide", "prune"], "--guide and --checkpoint go together"),
-        (["paln"], "unknown command 'paln', expected one of generate, label"),
+        (["paln"], "unknown command 'paln', expected one of estimate, generate, label"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(
@@ -119,22 +131,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert err.count("\n") == 1
     assert err.startswith(f"relevance {arguments[0]}: ")
     assert expected in err
-    assert not [
-        file for file in tmp_path.rglob("*") if file.is_file() and file.name != "dataset.json"
-    ]
-
-
-def test_a_value_error_of_a_library_is_not_called_bad_input(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    import relevance.store
-
-    def broken(path: Path, query: str, *, policy: str | None) -> None:
-        json.loads("{")
-
-    monkeypatch.setattr(relevance.store, "sql", broken)
-    with pytest.raises(json.JSONDecodeError):
-        main(["sql", "none", "select 1"])
+    assert not [*tmp_path.rglob("*")]
 
 
 def _plan(
@@ -157,11 +154,12 @@ def test_plan_prints_one_json_line_a_goal(tmp_path: Path) -> None:
     for line in lines:
         assert set(line) == {
             *("id", "goal", "status", "reason", "actions", "moved", "final"),
-            *("cost", "seconds", "counts", "replay"),
-        }
+            *("cost", "ambiguous", "seconds", "counts", "replay"),
+        } | (set(line) & {"blocking"})
         assert set(line["counts"]) == {"nodes", "pose", "keyframe", "path"}
         assert (line["id"], line["status"]) == ("s1", "solved")
         assert line["replay"]["ok"]
+        assert line["replay"]["reason"] == ""
         assert 0 <= line["replay"]["max_penetration"] <= 1e-3
         assert line["seconds"] > 0
         assert set(line["final"]) == set(line["moved"])
@@ -224,21 +222,6 @@ def test_sql_prints_what_a_program_can_read(
         assert int(capsys.readouterr().out.splitlines()[1]) >= 0
 
 
-def test_sql_ends_quietly_when_nobody_reads_on(dataset: Path) -> None:
-    query = "select repeat('x', 1000) from range(10000)"
-    with subprocess.Popen(
-        [RELEVANCE, "sql", dataset, query, "--format", "csv"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    ) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        process.stdout.readline()
-        process.stdout.close()
-        assert process.stderr.read() == b""
-    assert process.returncode == 0
-
-
 def test_stats_and_check_speak_of_the_dataset(
     dataset: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -262,36 +245,13 @@ def test_check_finds_what_was_broken(dataset: Path, tmp_path: Path) -> None:
     assert tar.name in done.stdout
 
 
-def test_an_interrupted_run_is_tidy_and_goes_on(tmp_path: Path) -> None:
-    root = tmp_path / "dataset"
-    command = [
-        RELEVANCE,
-        "generate",
-        root,
-        "--preset",
-        "smoke",
-        "--train.same-plane=200",
-        "--workers=1",
-    ]
-    process = subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-        # a background job of a plain shell is born deaf to SIGINT, and so are its children
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    end = time.monotonic() + 120
-    while not [*root.glob("scenes/*/*.parquet")]:
-        assert time.monotonic() < end, "no shard in two minutes"
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: everybody hears it
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "interrupted" in errors.decode()
-    assert "Traceback" not in errors.decode()
-    assert not [*root.rglob("*.tmp")]
-    assert main(["sql", str(root), "select count(*) from scenes"]) == 0
+def test_equal_column_names_are_kept_apart_and_decimals_are_numbers(
+    dataset: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    query = "select 1 as a, 2 as a, 3 as a_1, 1.5 as half, sum(2.0) as two"
+    assert main(["sql", str(dataset), query, "--format", "json"]) == 0
+    [row] = json.loads(capsys.readouterr().out)
+    assert row == {"a": 1, "a_2": 2, "a_1": 3, "half": 1.5, "two": 2}
 
 
 def test_json_is_strict() -> None:

@@ -19,9 +19,10 @@ from typing import Any
 
 import pytest
 
-from flows.parameters import ParameterError, configured
-from flows.plugin import FLOWS
+from flows.parameters import configured
+from flows.plugin import deployments
 from relevance.benchmarks.crashes import kill_all, members
+from relevance.errors import RelevanceError
 
 ROOT = Path(__file__).parent.parent
 BIN = Path(sys.executable).parent
@@ -84,7 +85,7 @@ def _task(function: Callable[..., Any]) -> Any:
     from prefect import task
     from prefect.cache_policies import NO_CACHE
 
-    from flows.shards import worth_retrying
+    from flows.head import worth_retrying
 
     return task(function, retries=1, retry_condition_fn=worth_retrying, cache_policy=NO_CACHE)
 
@@ -101,7 +102,7 @@ def test_results_come_by_name_and_a_dead_worker_costs_a_new_pool(
 def test_a_failing_shard_is_retried_and_does_not_stop_the_others(
     prefect_server: None, tmp_path: Path
 ) -> None:
-    from flows.shards import ShardsFailed
+    from relevance.workers import ShardsFailed
 
     jobs = {str(n): {"value": n, "folder": str(tmp_path)} for n in (1, 4, 5, 6)}
     with pytest.raises(
@@ -224,12 +225,12 @@ def test_flows_leave_artifacts_and_events(dataset: Path) -> None:
 def test_a_second_run_makes_nothing_and_tells_nobody(
     dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from flows import shards
+    from flows import head
     from flows.generate import generate
     from flows.label import label
 
     told: list[Any] = []
-    monkeypatch.setattr(shards, "emit_event", lambda *args, **more: told.append(args))
+    monkeypatch.setattr(head, "emit_event", lambda *args, **more: told.append(args))
     before = {file: file.stat().st_mtime_ns for file in dataset.rglob("*") if file.is_file()}
     assert generate(dataset=str(dataset), preset="smoke", overrides=FEW)["written"] == 0
     assert label(dataset=str(dataset), predicates=["on"], max_workers=1)["written"] == 0
@@ -239,7 +240,7 @@ def test_a_second_run_makes_nothing_and_tells_nobody(
 
 
 def test_flows_refuse_what_is_not_there(prefect_server: None, tmp_path: Path) -> None:
-    from flows.evaluate import newest_checkpoint
+    from flows.evaluate import evaluate
     from flows.generate import generate
     from flows.label import label
     from flows.train import train
@@ -248,15 +249,15 @@ def test_flows_refuse_what_is_not_there(prefect_server: None, tmp_path: Path) ->
     for flow in (label, train):
         with pytest.raises(ValueError, match=r"no dataset\.json there"):
             flow(dataset=str(tmp_path / "none"))
-    with pytest.raises(ParameterError, match=r"train\.sum_plane: unknown setting"):
+    with pytest.raises(RelevanceError, match=r"train\.sum_plane: unknown setting"):
         generate(dataset=str(tmp_path / "a"), preset="smoke", overrides={"train.sum_plane": 1})
     assert list(tmp_path.iterdir()) == []
     prepare(tmp_path, DatasetConfig.smoke())
-    with pytest.raises(ParameterError, match="no checkpoints there, expected `train` first"):
-        newest_checkpoint(tmp_path)
-    with pytest.raises(ParameterError, match="no scenes of these predicates"):
+    with pytest.raises(RelevanceError, match="no checkpoints there, expected `train` first"):
+        evaluate(dataset=str(tmp_path))
+    with pytest.raises(RelevanceError, match="no scenes of these predicates"):
         label(dataset=str(tmp_path))
-    with pytest.raises(ParameterError, match="unknown 'above', expected on-the-left"):
+    with pytest.raises(RelevanceError, match="unknown predicate 'above', expected one of"):
         label(dataset=str(tmp_path), predicates=["above"])
 
 
@@ -269,7 +270,7 @@ def test_another_policy_is_a_parameter(dataset: Path) -> None:
     assert (made["shards"], made["written"]) == (3, 3)
     assert [of.policy for of in Dataset.open(dataset).labellings()] == ["any-minimal"]
     assert {name: c for name, c in _bytes(dataset).items() if name in before} == before
-    with pytest.raises(ParameterError, match="policy: unknown 'guess', expected found, nec"):
+    with pytest.raises(RelevanceError, match="policy 'guess': expected one of found, nec"):
         label(dataset=str(dataset), policy="guess")
 
 
@@ -304,7 +305,7 @@ def test_retrain_trains_evaluates_and_then_rests(dataset: Path) -> None:
     artifacts = _artifacts()
     speed = json.loads(artifacts["evaluation"]["data"])
     assert {row["guide"] for row in speed} >= {"prune", "prune-then-full"}
-    assert all(row["seconds_unguided"] > 0 and row["tasks"] > 0 for row in speed)
+    assert all("missed" in row and row["tasks"] > 0 for row in speed)
     assert report.as_uri() in artifacts["report"]["data"]
     assert str(report) in artifacts["evaluation-summary"]["data"]
     metrics = json.loads(artifacts["train-metrics"]["data"])
@@ -314,6 +315,28 @@ def test_retrain_trains_evaluates_and_then_rests(dataset: Path) -> None:
     assert not second["new"]
     assert second["checkpoint"] == checkpoint.stem
     assert (checkpoint.stat().st_mtime_ns, report.stat().st_mtime_ns) == changed
+
+
+def test_a_server_that_does_not_answer_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from prefect.settings import PREFECT_API_URL, PREFECT_HOME, temporary_settings
+
+    from flows.generate import generate
+    from flows.head import NoServer
+
+    dead = "http://127.0.0.1:9/api"
+    with (
+        temporary_settings({PREFECT_API_URL: dead}),
+        pytest.raises(NoServer, match=f"PREFECT_API_URL {dead}: no Prefect server answers"),
+    ):
+        generate(dataset=str(tmp_path / "new"), preset="smoke")
+    with (
+        temporary_settings({PREFECT_HOME: "/dev/null/x"}, restore_defaults={PREFECT_API_URL}),
+        pytest.raises(NoServer, match="PREFECT_HOME /dev/null/x: Not a directory, expected"),
+    ):
+        generate(dataset=str(tmp_path / "new"), preset="smoke")
+    assert not (tmp_path / "new").exists()
 
 
 # --- no server, and a violent end ----------------------------------------------------------
@@ -476,9 +499,9 @@ def test_deployments_schedule_and_trigger_on_a_real_server(tmp_path: Path) -> No
         _wait_for(healthy, 180, "a healthy server")
         _prefect("work-pool", "create", "relevance", "--type", "process", env=env)
         _prefect("--no-prompt", "deploy", "--all", env=env)
-        deployments = {item["name"]: item for item in post("/deployments/filter")}
-        assert set(deployments) == set(FLOWS)
-        assert [s["schedule"]["cron"] for s in deployments["retrain"]["schedules"]] == ["0 3 * * *"]
+        there = {item["name"]: item for item in post("/deployments/filter")}
+        assert set(there) == set(deployments())
+        assert [s["schedule"]["cron"] for s in there["retrain"]["schedules"]] == ["0 3 * * *"]
         [automation] = post("/automations/filter")
         assert automation["trigger"]["expect"] == ["shards.written"]
 

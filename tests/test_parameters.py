@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from flows.parameters import configured, override
-from flows.plugin import FLOWS, full_name, wrap_read_deployment
+from flows.parameters import configured
+from flows.plugin import deployments, full_name, wrap_read_deployment
+from relevance.configs import override
 
 
 def test_overrides_reach_nested_settings() -> None:
@@ -61,7 +62,8 @@ def test_flows_refuse_bad_parameters_before_any_work(tmp_path: Path) -> None:
 
 
 def test_short_names_are_only_ours() -> None:
-    assert [full_name(name) for name in FLOWS] == [f"{name}/{name}" for name in FLOWS]
+    assert set(deployments()) == {"generate", "label", "train", "evaluate", "retrain"}
+    assert [full_name(name) for name in deployments()] == [f"{n}/{n}" for n in deployments()]
     assert full_name("generate/other") == "generate/other"
     assert full_name("somebody") == "somebody"
 

@@ -30,8 +30,8 @@ from relevance.pipeline import (
     label_shard,
     load_config,
     prepare,
+    shard_specs,
     shards,
-    work,
 )
 from relevance.sampling import SceneConfig, sample_goals, sample_scene
 from relevance.scene import FAMILIES, PREDICATES
@@ -95,8 +95,8 @@ configs = st.builds(
 
 
 @given(configs)
-def test_work_covers_every_scene_once(config: DatasetConfig) -> None:
-    specs = work(config)
+def test_shards_cover_every_scene_once(config: DatasetConfig) -> None:
+    specs = shard_specs(config)
     for split in SPLITS:
         mine = [spec for spec in specs if spec.split == split]
         assert [spec.shard for spec in mine] == list(range(len(mine)))
@@ -110,8 +110,8 @@ def test_work_covers_every_scene_once(config: DatasetConfig) -> None:
 
 @given(configs, configs)
 def test_appending_never_renumbers(first: DatasetConfig, second: DatasetConfig) -> None:
-    before = work(first)
-    after = work(second, before)
+    before = shard_specs(first)
+    after = shard_specs(second, before)
     assert [spec for spec in after if spec in before] == before
     for split in SPLITS:
         mine = [spec for spec in after if spec.split == split]

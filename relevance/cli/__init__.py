@@ -1,35 +1,117 @@
 """The `relevance` command: one subcommand a stage, flags derived from the types.
 
 `relevance --help` stays quick, since each subcommand imports what it needs only when it is the
-one. Bad input (a ValueError that this project raised) is one line on stderr and exit code 2; a
-dataset that breaks its contracts is exit code 1.
+one. What becomes of an error is decided here alone: what the user can mend (a RelevanceError, a
+file or a disk that refuses) is one line on stderr and exit code 2; anything else is a fault of
+this project, a traceback that says so and exit code 70.
 """
 
 from __future__ import annotations
 
 import functools
+import io
 import itertools
 import os
+import select
 import sys
+import traceback
+import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr, suppress
 from typing import get_args
 
 import tyro
 
-from relevance.cli.arguments import Preset
-from relevance.cli.commands import COMMANDS, Command
+from relevance.cli.arguments import Command, Preset
+from relevance.cli.commands import COMMANDS
 from relevance.cli.terminal import UsageError, say
+from relevance.errors import RelevanceWarning
+
+FAULT = 70
+"""Exit code of a fault of this project (EX_SOFTWARE of sysexits.h)."""
+CODES = (
+    "exit codes: 0 done, 1 a check failed or a replay refused a plan, 2 you can mend it (one line\n"
+    f"says what), 130 interrupted, {FAULT} a fault of relevance: please report its traceback"
+)
 
 
-def _ours(error: BaseException) -> bool:
-    """Whether this project raised it, rather than a library that met a mistake of ours."""
-    packages = ("relevance.", "flows.")
-    if type(error).__module__.startswith(packages):
-        return True
-    trace, module = error.__traceback__, ""
-    while trace is not None:
-        module, trace = trace.tb_frame.f_globals.get("__name__", ""), trace.tb_next
-    return f"{module}.".startswith(packages)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a subcommand; returns its exit code (see CODES)."""
+    _open_streams()
+    name, *rest = [*(sys.argv[1:] if arguments is None else arguments)] or ["--help"]
+    try:
+        try:
+            with warnings.catch_warnings():
+                _tell_warnings(name)
+                return _run(name, rest)
+        finally:
+            sys.stdout.flush()
+    except KeyboardInterrupt:
+        say("interrupted; what was finished stays, the same command goes on from there")
+        return 130
+    except BrokenPipeError as error:
+        _drop_output()
+        if _nobody_reads():  # `relevance sql ... | head`
+            return 0
+        return _refuse(name, error)
+    except (OSError, ValueError) as error:
+        if isinstance(error, OSError):
+            _drop_output()
+        if isinstance(error, OSError) or _ours(error):
+            return _refuse(name, error)
+        return _report()
+    except Exception:
+        return _report()
+
+
+def _run(name: str, rest: list[str]) -> int:
+    if name in ("-h", "--help", "help"):
+        print(_help())
+        return 0
+    if name == "--version":
+        from importlib.metadata import version
+
+        print(f"relevance {version('relevance')}")
+        return 0
+    targets = {full: c for full, c in COMMANDS.items() if full.startswith(f"{name} ")}
+    if targets and (not rest or rest[0] in ("-h", "--help")):  # `relevance bench`
+        print(_help(targets))
+        return 0
+    if targets:  # `relevance bench planner`: two words name one command
+        name, *rest = f"{name} {rest[0]}", *rest[1:]
+    if name not in COMMANDS:
+        known = ", ".join(targets or COMMANDS)
+        raise UsageError(f"unknown command {name!r}, expected one of {known}")
+    command = COMMANDS[name]
+    run = command.make(_preset(rest, command.preset))
+    about = "\n".join([(run.__doc__ or "").partition("Args:")[0].strip(), "", "examples:"])
+    about += "".join(f"\n  {example}" for example in command.examples)
+    return _parse(name, run, f"{about}\n\n{CODES}", rest)()
+
+
+def _parse(name: str, run: Callable[..., int], about: str, rest: list[str]) -> Callable[[], int]:
+    """The command with its flags; tyro's page about a wrong flag becomes one line."""
+    wrong = io.StringIO()
+    try:
+        with redirect_stderr(wrong):
+            return tyro.cli(
+                functools.wraps(run)(lambda **given: functools.partial(run, **given)),
+                prog=f"relevance {name}",
+                description=about,
+                args=rest,
+            )
+    except SystemExit as end:
+        if end.code in (None, 0):
+            raise
+        raise UsageError(f"{_first(wrong.getvalue())}; see relevance {name} --help") from None
+
+
+def _first(page: str) -> str:
+    """What a page of tyro says first: between its first two rules, drawn as stderr allows."""
+    lines = [line.strip(" │╭╮╰╯") for line in page.splitlines()]
+    rules = [number for number, line in enumerate(lines) if "──" in line or "---" in line]
+    said = lines[rules[0] + 1 : rules[1]] if len(rules) > 1 else lines
+    return " ".join(" ".join(said).split())
 
 
 def _preset(arguments: Sequence[str], default: Preset) -> Preset:
@@ -49,50 +131,77 @@ def _help(commands: Mapping[str, Command] = COMMANDS) -> str:
     width = max(map(len, commands))
     lines = ["usage: relevance COMMAND [options]; `relevance COMMAND --help` shows the options", ""]
     lines += [f"  {name:<{width}}  {command.about}" for name, command in commands.items()]
-    lines += ["", "examples:", *(f"  {c.examples[0]}" for c in commands.values())]
+    lines += ["", "examples:", *(f"  {c.examples[0]}" for c in commands.values()), "", CODES]
     return "\n".join(lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a subcommand; returns its exit code (0, 1 for a failed check, 2 for bad input)."""
-    name, *rest = [*(sys.argv[1:] if arguments is None else arguments)] or ["--help"]
-    if name in ("-h", "--help", "help"):
-        print(_help())
-        return 0
-    if name == "--version":
-        from importlib.metadata import version
+# --- what becomes of an error ------------------------------------------------------------
 
-        print(f"relevance {version('relevance')}")
-        return 0
-    targets = {full: c for full, c in COMMANDS.items() if full.startswith(f"{name} ")}
-    if targets and (not rest or rest[0] in ("-h", "--help")):  # `relevance bench`
-        print(_help(targets))
-        return 0
-    try:
-        if targets:  # `relevance bench planner`: two words name one command
-            name, *rest = f"{name} {rest[0]}", *rest[1:]
-        if name not in COMMANDS:
-            known = ", ".join(targets or COMMANDS)
-            raise UsageError(f"unknown command {name!r}, expected one of {known}")
-        command = COMMANDS[name]
-        run = command.make(_preset(rest, command.preset))
-        about = "\n".join([(run.__doc__ or "").partition("Args:")[0].strip(), "", "examples:"])
-        about += "".join(f"\n  {example}" for example in command.examples)
-        ready: Callable[[], int] = tyro.cli(
-            functools.wraps(run)(lambda **given: functools.partial(run, **given)),
-            prog=f"relevance {name}",
-            description=about,
-            args=rest,
-        )
-        return ready()
-    except ValueError as error:
-        if not _ours(error):
-            raise
-        say(f"relevance {name}: {' '.join(str(error).split())}")
-        return 2
-    except KeyboardInterrupt:
-        say("interrupted; what was finished stays, the same command goes on from there")
-        return 130
-    except BrokenPipeError:  # `relevance sql ... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+
+def _ours(error: BaseException) -> bool:
+    """Whether this project raised it, rather than a library that met a mistake of ours."""
+    packages = ("relevance.", "flows.")
+    if type(error).__module__.startswith(packages):
+        return True
+    trace, module = error.__traceback__, ""
+    while trace is not None:
+        module, trace = trace.tb_frame.f_globals.get("__name__", ""), trace.tb_next
+    return f"{module}.".startswith(packages)
+
+
+def _refuse(name: str, error: Exception) -> int:
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        files = [str(file) for file in (error.filename, error.filename2) if file is not None]
+        text = ": ".join([*files, error.strerror])
+    say(f"relevance {name}: {' '.join(text.split())}")
+    return 2
+
+
+def _report() -> int:
+    traceback.print_exc()
+    say("this is a fault of relevance, not of yours: please report it with the lines above")
+    return FAULT
+
+
+def _tell_warnings(name: str) -> None:
+    """Print this project's own warnings as one line each, and leave the others as they are."""
+    show = warnings.showwarning
+
+    def tell(message: Warning | str, category: type[Warning], *where: object) -> None:
+        if issubclass(category, RelevanceWarning):
+            say(f"relevance {name}: warning: {' '.join(str(message).split())}")
+        else:
+            show(message, category, *where)  # pyright: ignore[reportArgumentType]
+
+    warnings.simplefilter("always", RelevanceWarning)
+    warnings.showwarning = tell  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _open_streams() -> None:
+    """Give a process that was started without a standard stream one that leads nowhere.
+
+    Else the next file that is opened would take its number, and get what is printed.
+    """
+    for number, mode, name in ((0, "r", "stdin"), (1, "w", "stdout"), (2, "w", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
+            setattr(sys, name, os.fdopen(number, mode, closefd=False))
+
+
+def _nobody_reads() -> bool:
+    poll = select.poll()
+    for stream in (1, 2):
+        poll.register(stream, 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
+
+
+def _drop_output() -> None:
+    """Lead away what stdout still holds when it cannot be written, as the end would try again."""
+    with suppress(OSError, ValueError):
+        try:
+            sys.stdout.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

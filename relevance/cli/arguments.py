@@ -1,14 +1,53 @@
-"""Arguments that several subcommands take."""
+"""Arguments that several subcommands take, and what all commands are described by."""
 
+import math
 import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from relevance.cli.terminal import UsageError
+
 Preset = Literal["smoke", "demo", "laptop", "paper"]
 DatasetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATASET")]
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+OptionalName = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
+OptionalCount = Annotated[int | None, tyro.conf.arg(metavar="N")]
 Workers = Annotated[int, tyro.conf.arg(metavar="N")]
 
 CORES = len(os.sched_getaffinity(0))
+MOST_WORKERS = 1024
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """A subcommand: what makes its function, what it does in a few words, examples."""
+
+    make: Callable[[Preset], Callable[..., int]]
+    about: str
+    examples: tuple[str, ...]
+    preset: Preset = "demo"
+
+
+def at_least(flag: str, value: float | None, least: float, most: float = math.inf) -> None:
+    """UsageError that names the flag, unless it is not given, or a number within the bounds."""
+    if value is not None and not (least <= value <= most and math.isfinite(value)):
+        expected = f"{least:g} to {most:g}" if math.isfinite(most) else f"at least {least:g}"
+        if not math.isfinite(least):
+            expected = "a finite number"
+        raise UsageError(f"{flag} {value}: expected {expected}")
+
+
+def check_workers(workers: int) -> None:
+    """UsageError unless that many processes can be had."""
+    at_least("--workers", workers, 1, MOST_WORKERS)
+
+
+def one_of(flag: str, value: str | None, known: Iterable[str]) -> None:
+    """UsageError that names the flag and what there is, unless the value is not given or known."""
+    names = list(known)
+    if value is not None and value not in names:
+        raise UsageError(f"{flag} {value}: expected one of {', '.join(names)}")

@@ -1,32 +1,43 @@
-"""Many units of work on many processes, with one progress bar."""
+"""Units of work on the processes of this machine, with one progress bar."""
 
 from __future__ import annotations
 
 import multiprocessing
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Protocol
 
-from relevance.cli.terminal import UsageError, bar
+from relevance.cli.arguments import check_workers
+from relevance.cli.terminal import bar, say
+from relevance.workers import Outcomes, prepare_worker
 
-Job = tuple[Callable[..., Any], tuple[Any, ...]]
-"""A stage and its arguments; it is called as stage(*arguments, progress)."""
+if TYPE_CHECKING:
+    from relevance.pipeline import Made, Work
+
+
+class Unit(Protocol):
+    """A unit of work of that many steps; `run` calls progress(done, total)."""
+
+    @property
+    def size(self) -> int: ...
+
+    @property
+    def run(self) -> Callable[[Callable[[int, int], None]], Any]: ...
+
 
 _done: Any = None
-"""In a worker process: how many units of work the workers have done together."""
+"""In a worker process: how many steps the workers have done together."""
 
 
-def _prepare_worker(counter: Any) -> None:
+def _prepare(counter: Any) -> None:
     global _done
     _done = counter
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    prepare_worker()
 
 
-def _run_job(job: Job, size: int) -> Any:
-    stage, arguments = job
+def _run(unit: Unit) -> Any:
     told = 0
 
     def progress(done: int, total: int) -> None:
@@ -35,50 +46,53 @@ def _run_job(job: Job, size: int) -> Any:
             _done.value += done - told
         told = done
 
-    report = stage(*arguments, progress)
-    progress(size, size)
+    report = unit.run(progress)
+    progress(unit.size, unit.size)
     return report
 
 
-def in_processes(
-    what: str,
-    jobs: Sequence[Job],
-    sizes: Sequence[int],
-    n: int,
-) -> list[Any]:
-    """Run stage(*arguments, progress) for each job on n processes; results in order."""
-    if n < 1:
-        raise UsageError(f"--workers {n}: expected at least 1")
+@contextmanager
+def processes(what: str, total: int, n: int) -> Iterator[Outcomes[Unit]]:
+    """Yields what runs units of work on n fresh processes; the bar fills up to `total` steps."""
+    check_workers(n)
     context = multiprocessing.get_context("spawn")
     counter = context.Value("q", 0)
-    pool = ProcessPoolExecutor(
-        min(n, len(jobs)) or 1, context, initializer=_prepare_worker, initargs=(counter,)
-    )
-    try:
-        futures = [pool.submit(_run_job, job, size) for job, size in zip(jobs, sizes, strict=True)]
-        with bar(what) as progress:
-            left = set(futures)
-            while left:
-                finished, left = wait(left, timeout=0.2, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    future.result()
-                progress(counter.value, sum(sizes))
-        return [future.result() for future in futures]
-    except BaseException:
-        # Nothing half-made can pass for a shard: a file appears by a rename at the end.
-        for process in list((pool._processes or {}).values()):
-            process.terminate()
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    with bar(what) as progress:
+
+        def outcomes(units: Mapping[str, Unit]) -> Generator[tuple[str, Any], None, None]:
+            most = min(n, len(units))
+            pool = ProcessPoolExecutor(most, context, initializer=_prepare, initargs=(counter,))
+            try:
+                waiting = {pool.submit(_run, unit): name for name, unit in units.items()}
+                while waiting:
+                    ended, _ = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
+                    progress(counter.value, total)
+                    for future in sorted(ended, key=_broke):
+                        if _broke(future):
+                            future.result()
+                        yield waiting.pop(future), future.exception() or future.result()
+            except GeneratorExit:
+                raise  # enough have failed; what is under way may finish
+            except BaseException:
+                # Nothing half-made can pass for a shard: a file appears by a rename at the end.
+                for process in list((pool._processes or {}).values()):
+                    process.terminate()
+                raise
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+        yield outcomes
 
 
-def make_shards(dataset: Path, jobs: Sequence[Job], sizes: Sequence[int], n: int) -> None:
-    """Run jobs that write a dataset's shards; those cut short leave no temporary file."""
+def _broke(future: Future[Any]) -> bool:
+    return isinstance(future.exception(), BrokenProcessPool)
+
+
+def make(what: str, work: Work, n: int) -> Made:
+    """Do the work on n processes, as the flows do it on theirs."""
     # Here and not above: `relevance --help` reads this file and loads no pyarrow.
-    from relevance.store import locate, sweep
+    from relevance.pipeline import do
 
-    try:
-        in_processes("scenes", jobs, sizes, n)
-    finally:
-        sweep(locate(dataset))
+    total = sum(job.size for job in work.jobs)
+    with processes(what, total, n) as outcomes:
+        return do(work, outcomes, warn=say)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from decimal import Decimal
 from typing import Any, Literal
 
 from rich.console import Console
@@ -37,6 +39,8 @@ def to_json(value: Any) -> str:
     """One line of strict JSON; NaN and infinities, which JSON has not, become null."""
 
     def strict(value: Any) -> Any:
+        if isinstance(value, Decimal):
+            value = int(value) if value == value.to_integral_value() else float(value)
         if isinstance(value, float) and not math.isfinite(value):
             return None
         if isinstance(value, Mapping):
@@ -48,12 +52,23 @@ def to_json(value: Any) -> str:
     return json.dumps(strict(value), default=str, allow_nan=False)
 
 
+def distinct(columns: Sequence[str]) -> list[str]:
+    """The names, with _1, _2, ... at the end of one that was there before."""
+    names: list[str] = []
+    for column in columns:
+        numbered = (f"{column}_{number}" for number in itertools.count(1))
+        taken = {*names, *(columns if column in names else ())}  # `a_1` may be a name itself
+        names.append(next(n for n in itertools.chain([column], numbered) if n not in taken))
+    return names
+
+
 def show(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], format: Format, title: str | None = None
 ) -> None:
     """Print rows: a table, one JSON list of objects, or CSV with a header."""
     if format == "json":
-        print(to_json([dict(zip(columns, row, strict=True)) for row in rows]))
+        names = distinct(columns)
+        print(to_json([dict(zip(names, row, strict=True)) for row in rows]))
     elif format == "csv":
         writer = csv.writer(sys.stdout, lineterminator="\n")
         writer.writerow(columns)

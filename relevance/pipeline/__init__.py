@@ -1,5 +1,6 @@
 """Making a dataset: its settings and shards, how they are made, kept, merged and estimated."""
 
+from relevance.pipeline.doing import Made, do
 from relevance.pipeline.estimating import Estimate, Quantities, actual, estimate
 from relevance.pipeline.merging import merge
 from relevance.pipeline.settings import (
@@ -12,8 +13,8 @@ from relevance.pipeline.settings import (
     describe,
     load_config,
     prepare,
+    shard_specs,
     shards_of,
-    work,
 )
 from relevance.pipeline.shards import (
     ATTEMPTS,
@@ -24,6 +25,7 @@ from relevance.pipeline.shards import (
     labelled,
 )
 from relevance.pipeline.upkeep import finish, integrity, repair
+from relevance.pipeline.work import Job, Work, labels_work, missing, scenes_work
 
 __all__ = [
     "ATTEMPTS",
@@ -31,12 +33,16 @@ __all__ = [
     "Counts",
     "DatasetConfig",
     "Estimate",
+    "Job",
+    "Made",
     "Quantities",
     "ShardReport",
     "ShardSpec",
+    "Work",
     "actual",
     "append",
     "describe",
+    "do",
     "draw",
     "estimate",
     "finish",
@@ -45,10 +51,13 @@ __all__ = [
     "integrity",
     "label_shard",
     "labelled",
+    "labels_work",
     "load_config",
     "merge",
+    "missing",
     "prepare",
     "repair",
+    "scenes_work",
+    "shard_specs",
     "shards_of",
-    "work",
 ]

@@ -20,7 +20,7 @@ from relevance.pipeline.settings import (
     ShardReport,
     ShardSpec,
     prepare,
-    work,
+    shard_specs,
 )
 from relevance.pipeline.shards import generate_shard, label_shard
 from relevance.scene import FAMILIES
@@ -125,7 +125,7 @@ def estimate(
             "select avg(s), stddev_samp(s), count(*) from (select scene_id, sum(seconds) as s"
             " from timings join plans using (plan_id) group by scene_id)",
         )
-    planned = work(config)
+    planned = shard_specs(config)
     total = _Rates()
     for family in FAMILIES:
         for split in SPLITS:

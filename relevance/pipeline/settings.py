@@ -202,7 +202,7 @@ class ShardReport:
     seconds: float = 0.0
 
 
-def work(config: DatasetConfig, finished: list[ShardSpec] | None = None) -> list[ShardSpec]:
+def shard_specs(config: DatasetConfig, finished: list[ShardSpec] | None = None) -> list[ShardSpec]:
     """Every shard of a config; `finished` ones stay as they are, more are appended to them."""
     specs = list(finished or ())
     for split in SPLITS:
@@ -238,13 +238,13 @@ def prepare(
     """
     root = locate(root)
     if not (root / "dataset.json").exists():
-        specs = work(config)
+        specs = shard_specs(config)
         Dataset.create(root, describe(config, specs))
         return specs
     there = Dataset.open(root)
     refuse_merged(there)
     sweep(root)
-    specs = work(config, shards_of(there))
+    specs = shard_specs(config, shards_of(there))
     for split in SPLITS:  # asking for fewer than there are keeps what there is
         grown = {
             name: sum(s.count for s in specs if (s.split, s.family) == (split, family))

@@ -1,0 +1,133 @@
+"""Subcommands that ask a dataset: check, sql, stats, report."""
+
+# No `from __future__ import annotations`: tyro reads the annotations of local functions.
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from relevance.cli.arguments import Command, DatasetArg, OptionalName, OptionalPath, Preset
+from relevance.cli.terminal import Format, bar, console, say, show, to_json
+
+
+def _check(_: Preset) -> Callable[..., int]:
+    def check(dataset: DatasetArg, render: bool = True) -> int:
+        """Check every contract of a dataset; exit code 1 and a line for each breach.
+
+        Args:
+            dataset: Folder of the dataset.
+            render: Also render one scene of each shard again and compare the pixels.
+        """
+        from relevance.pipeline.checking import check
+
+        with bar("files") as progress:
+            breaches = check(dataset, render=render, progress=progress)
+        for breach in breaches:
+            print(breach)
+        say(
+            f"{dataset}: {len(breaches)} breaches" if breaches else f"{dataset}: all contracts hold"
+        )
+        return 1 if breaches else 0
+
+    return check
+
+
+def _sql(_: Preset) -> Callable[..., int]:
+    def sql(
+        dataset: DatasetArg,
+        query: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="QUERY")],
+        format: Format = "table",
+        policy: OptionalName = None,
+    ) -> int:
+        """Ask DuckDB about a dataset; there is a view for each table.
+
+        Args:
+            dataset: Folder of the dataset.
+            query: SQL over scenes, objects, plans, labels, predictions, evaluations, checkpoints.
+            format: How to print the rows.
+            policy: The label policy that `labels` shows; the dataset's own when not given.
+        """
+        from relevance.store import sql
+
+        show(*sql(dataset, query, policy=policy), format)
+        return 0
+
+    return sql
+
+
+def _stats(_: Preset) -> Callable[..., int]:
+    def stats(
+        dataset: DatasetArg,
+        format: Literal["table", "json"] = "table",
+        card: Path | None = None,
+    ) -> int:
+        """Count a dataset: label balance, plan lengths, failures by reason, visibility, time.
+
+        Args:
+            dataset: Folder of the dataset.
+            format: How to print the tables.
+            card: Folder to write a dataset card to instead: a page of Markdown and its pictures.
+        """
+        from relevance.report.card import write_card
+        from relevance.report.tables import statistics
+
+        if card is not None:
+            print(write_card(dataset, card))
+            return 0
+        found = statistics(dataset)
+        if format == "json":
+            print(to_json(dataclasses.asdict(found)))
+        else:
+            for table in found.tables:
+                show(table.columns, table.rows, "table", title=table.title)
+        return 0
+
+    return stats
+
+
+def _report(_: Preset) -> Callable[..., int]:
+    def report(dataset: DatasetArg, out: OptionalPath = None) -> int:
+        """Write the report, one HTML file that opens offline; prints its path.
+
+        Args:
+            dataset: Folder of the dataset.
+            out: Where to; DATASET/report.html when not given.
+        """
+        from relevance.report import page
+
+        with console.status("report"):
+            path = page.build(dataset, out)
+        print(path)
+        return 0
+
+    return report
+
+
+COMMANDS = {
+    "check": Command(
+        make=_check,
+        about="every contract of a dataset",
+        examples=("relevance check data/tables", "relevance check data/tables --no-render"),
+    ),
+    "sql": Command(
+        make=_sql,
+        about="ask DuckDB about a dataset",
+        examples=(
+            'relevance sql data/tables "select relevant, count(*) from labels group by 1"',
+            'relevance sql data/tables "from plans" --format csv > plans.csv',
+            'relevance sql data/tables "select why, count(*) from label_changes group by all"',
+        ),
+    ),
+    "stats": Command(
+        make=_stats,
+        about="label balance, plan lengths, visibility",
+        examples=("relevance stats data/tables", "relevance stats data/tables --card out/card"),
+    ),
+    "report": Command(
+        make=_report,
+        about="tables and figures as one HTML file",
+        examples=("relevance report data/tables",),
+    ),
+}

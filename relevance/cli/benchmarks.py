@@ -1,0 +1,103 @@
+"""The subcommands `bench planner` and `bench dataset`."""
+
+# No `from __future__ import annotations`: tyro reads the annotations of local functions.
+import os
+import secrets
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from relevance.cli.arguments import Command, Preset, at_least
+from relevance.cli.bench import bench_planner, hand_over
+from relevance.cli.terminal import bar, say
+
+Part = Literal["making", "reading", "queries", "crashes"]
+PARTS: tuple[Part, ...] = ("making", "reading", "queries", "crashes")
+OptionalSeed = Annotated[int | None, tyro.conf.arg(metavar="N")]
+OptionalFolder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")]
+
+
+def _bench(_: Preset) -> Callable[..., int]:
+    def bench(
+        scenes: int = 320,
+        rows: int = 50_000_000,
+        shards: int = 100,
+        kills: int = 24,
+        seed: OptionalSeed = None,
+        out: OptionalFolder = None,
+        parts: tuple[Part, ...] = PARTS,
+    ) -> int:
+        """Measure how datasets are made, read and asked, and kill processes that make one.
+
+        Writes tables and a CSV file for each part; the datasets themselves are not kept.
+
+        Args:
+            scenes: Scenes of each family whose goals are labelled, once by 1 process and once by 2;
+                scenes themselves are timed in shards of the laptop preset's size.
+            rows: Synthetic label rows to query.
+            shards: Files that they are in, for each predicate.
+            kills: How often the making of a small dataset is disturbed.
+            seed: Remakes an earlier run; a fresh one when not given.
+            out: Folder for tables and rows; data/bench/dataset-SEED when not given.
+            parts: What to measure.
+        """
+        for flag, count in (("scenes", scenes), ("rows", rows), ("shards", shards)):
+            at_least(f"--{flag}", count, 1)
+        at_least("--kills", kills, 1)
+        at_least("--seed", seed, 0, 2**31)
+        seed = secrets.randbits(31) if seed is None else seed
+        folder = out or Path("data/bench") / f"dataset-{seed}"
+        folder.mkdir(parents=True, exist_ok=True)
+        say(f"seed {seed}, pid {os.getpid()}, to {folder}")
+        from relevance.benchmarks import datasets
+
+        with tempfile.TemporaryDirectory(prefix="relevance-bench-") as scratch:
+            place = Path(scratch)
+            if "making" in parts:
+                with bar("units of work") as progress:
+                    made = datasets.measure_making(
+                        place, scenes=scenes, seed=seed, progress=progress
+                    )
+                hand_over(made, folder)
+            if "reading" in parts:
+                hand_over(datasets.measure_reading(place, seed=seed), folder)
+            if "queries" in parts:
+                with bar("files") as progress:
+                    asked = datasets.measure_queries(
+                        place, rows=rows, shards=shards, progress=progress
+                    )
+                hand_over(asked, folder)
+            if "crashes" in parts:
+                with bar("disturbances") as progress:
+                    survived = datasets.measure_crashes(
+                        place, kills=kills, seed=seed, progress=progress
+                    )
+                hand_over(survived, folder)
+        return 0
+
+    return bench
+
+
+COMMANDS = {
+    "bench planner": Command(
+        make=bench_planner,
+        about="the planner's speed, truth, stability and completeness",
+        examples=(
+            "relevance bench planner --tasks 1000",
+            "relevance bench planner --tasks 200 --seed 7 --parts speed truth",
+            "relevance bench planner --tasks 60 --against rai",
+        ),
+    ),
+    "bench dataset": Command(
+        make=_bench,
+        about="making, reading and asking datasets, and what they survive",
+        examples=(
+            "relevance bench dataset",
+            "relevance bench dataset --parts making --scenes 80",
+            "relevance bench dataset --parts crashes --kills 40",
+        ),
+    ),
+}

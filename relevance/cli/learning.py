@@ -1,0 +1,87 @@
+"""Subcommands about models: train, evaluate."""
+
+# No `from __future__ import annotations`: tyro reads the annotations of local functions.
+from collections.abc import Callable
+from typing import Annotated
+
+import tyro
+
+from relevance.cli.arguments import Command, DatasetArg, OptionalPath, Preset
+from relevance.cli.terminal import bar, say
+
+
+def _train(preset: Preset) -> Callable[..., int]:
+    from relevance.training import TrainConfig
+
+    start: TrainConfig = getattr(TrainConfig, preset)()
+
+    # --preset is a setting of TrainConfig itself.
+    def train(
+        dataset: DatasetArg,
+        out: OptionalPath = None,
+        config: Annotated[TrainConfig, tyro.conf.arg(name="")] = start,
+    ) -> int:
+        """Train a relevance model; prints the path of its checkpoint.
+
+        Args:
+            dataset: Folder of a labelled dataset.
+            out: Another folder for the checkpoint than DATASET/checkpoints.
+        """
+        from relevance.training import train
+
+        with bar("steps") as progress:
+            path = train(dataset, config, out=out, progress=progress)
+        print(path)
+        return 0
+
+    return train
+
+
+def _evaluate(preset: Preset) -> Callable[..., int]:
+    from relevance.evaluation import EvaluationConfig
+
+    start: EvaluationConfig = getattr(EvaluationConfig, preset)()
+
+    def evaluate(
+        dataset: DatasetArg,
+        checkpoint: OptionalPath = None,
+        preset: Preset = preset,
+        config: Annotated[EvaluationConfig, tyro.conf.arg(name="")] = start,
+    ) -> int:
+        """Rerun the planner on test scenes, unguided and guided by a checkpoint.
+
+        Args:
+            dataset: Folder of a labelled dataset.
+            checkpoint: The model; the dataset's newest when not given.
+            preset: Where the other settings start from.
+        """
+        from relevance import evaluation
+        from relevance.training.checkpoints import newest_checkpoint
+
+        path = checkpoint or newest_checkpoint(dataset)
+        checkpoint_id = evaluation.load_scorer(path).checkpoint_id
+        with bar("shards scored") as progress:
+            scored = evaluation.predict(dataset, path, split=config.split, progress=progress)
+        with bar("tasks") as progress:
+            rows = evaluation.evaluate(dataset, path, config, progress=progress)
+        say(f"{dataset}: {scored} predictions, {rows} comparisons of {checkpoint_id}")
+        return 0
+
+    return evaluate
+
+
+COMMANDS = {
+    "train": Command(
+        make=_train,
+        about="a relevance model",
+        examples=(
+            "relevance train data/tables --preset laptop",
+            "relevance train data/tables --steps 3000 --model.body vit",
+        ),
+    ),
+    "evaluate": Command(
+        make=_evaluate,
+        about="rerun the planner with a model's guidance",
+        examples=("relevance evaluate data/tables --tasks 100 --guides prune prune-then-full",),
+    ),
+}
