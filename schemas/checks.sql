@@ -59,8 +59,8 @@ WHERE NOT list_has_all(s.names, p.moved || [p.subject, p.reference]);
 
 -- rule: a plan is what its status says
 SELECT file, row, 'status' AS "column",
-    'expected solved, infeasible or limit, found ' || status AS message
-FROM plans WHERE status NOT IN ('solved', 'infeasible', 'limit')
+    'expected solved, infeasible, limit or refused, found ' || status AS message
+FROM plans WHERE status NOT IN ('solved', 'infeasible', 'limit', 'refused')
 UNION ALL
 SELECT file, row, 'n_actions', 'expected ' || len(actions) || ' actions, found ' || n_actions
 FROM plans WHERE n_actions <> len(actions)
@@ -76,8 +76,8 @@ SELECT file, row, 'reason', 'expected a reason for a goal that is not solved, fo
 FROM plans WHERE status <> 'solved' AND reason = ''
 UNION ALL
 SELECT file, row, 'actions',
-    'expected no actions for a goal that is not solved, found ' || n_actions
-FROM plans WHERE status <> 'solved' AND n_actions > 0
+    'expected no actions for a goal without a plan, found ' || n_actions
+FROM plans WHERE status NOT IN ('solved', 'refused') AND n_actions > 0
 UNION ALL
 SELECT file, row, 'cost', 'expected a cost for a solved goal, found null'
 FROM plans WHERE status = 'solved' AND cost IS NULL;

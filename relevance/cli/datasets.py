@@ -1,7 +1,6 @@
 """Subcommands that look after datasets: estimate, append, merge, repair, compact, export."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
-import functools
 import os
 import secrets
 import tempfile
@@ -149,32 +148,19 @@ def _repair(_: Preset) -> Callable[..., int]:
             dataset: Folder of the dataset.
             workers: Processes that work at a time.
         """
-        from relevance import pipeline
+        from relevance.pipeline import beyond_repair, missing
         from relevance.pipeline.checking import check
-        from relevance.scene import PREDICATES
-        from relevance.store import Dataset
 
         with bar("files checked") as progress:
             named = [breach.file for breach in check(dataset, progress=progress)]
         for name in dict.fromkeys(named):
             say(f"broken: {name}")
-        there = Dataset.open(dataset)
-        predicates = [
-            predicate
-            for predicate in PREDICATES.values()
-            if there.files("labels", predicate=predicate.name)
-            or predicate.name in there.description.get("finished", ())
-        ]
-        policies = sorted({of.policy for of in there.labellings()})
-        pipeline.repair(dataset, named)
-        config = pipeline.load_config(there)
-        specs = pipeline.prepare(dataset, config)
-        missing = [spec for spec in specs if not pipeline.generated(there, spec)]
-        jobs: list[Any] = [(pipeline.generate_shard, (dataset, config, s)) for s in missing]
-        make_shards(dataset, jobs, [spec.count for spec in missing], workers)
-        for policy in (None, *policies):
-            make_shards(dataset, *_labelling(dataset, config, specs, predicates, policy), workers)
-        pipeline.finish(dataset)
+        for name, why in beyond_repair(dataset, named).items():
+            say(f"left as it is: {name}: {why}")
+        for work in missing(dataset, named):
+            jobs = [(job.run, ()) for job in work.jobs]
+            make_shards(dataset, jobs, [job.size for job in work.jobs], workers)
+            work.finish()
         with bar("files checked") as progress:
             left = check(dataset, progress=progress)
         for breach in left:
@@ -183,24 +169,6 @@ def _repair(_: Preset) -> Callable[..., int]:
         return 1 if left else 0
 
     return repair
-
-
-def _labelling(
-    dataset: Path, config: Any, specs: Any, predicates: Any, policy: str | None
-) -> tuple[list[Any], list[int]]:
-    from relevance.pipeline import label_shard, labelled
-    from relevance.store import Dataset
-
-    there = Dataset.open(dataset)
-    pairs = [
-        (spec, predicate)
-        for spec in specs
-        for predicate in spec.predicates
-        if predicate in predicates and not labelled(there, config, spec, predicate, policy)
-    ]
-    stage = functools.partial(label_shard, policy=policy)
-    jobs = [(stage, (dataset, config, spec, predicate)) for spec, predicate in pairs]
-    return jobs, [spec.count for spec, _ in pairs]
 
 
 def _compact(_: Preset) -> Callable[..., int]:

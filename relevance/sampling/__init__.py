@@ -22,8 +22,12 @@ from relevance.sampling.randomisation import Randomisation
 from relevance.sampling.rows import bound, corners, crossing, extents, projected, row, rows
 from relevance.sampling.scenes import SceneConfig, sample_scene
 
+SAMPLER_VERSION = "1"
+"""Raised when equal settings give other scenes or goals."""
+
 __all__ = [
     "GRASPABLE_EDGE",
+    "SAMPLER_VERSION",
     "GoalConfig",
     "Randomisation",
     "SceneConfig",

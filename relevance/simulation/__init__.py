@@ -13,10 +13,14 @@ from relevance.simulation.rendering import (
 )
 from relevance.simulation.replaying import MAX_PENETRATION, Replay, panda_urdf, replay
 
+RENDERER_VERSION = "1"
+"""Raised when equal scenes give other pictures."""
+
 __all__ = [
     "MAX_PENETRATION",
     "MIN_VISIBLE_FRACTION",
     "MIN_VISIBLE_PIXELS",
+    "RENDERER_VERSION",
     "VIEW_PIXELS",
     "Renderer",
     "Rendering",

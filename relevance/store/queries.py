@@ -64,7 +64,7 @@ def connect(
         files: list[Path] = []
         if (dataset.path / "beside").is_dir() or dataset.sources:
             chosen = _files_of(dataset, table, policy)
-            files = [file for file in _beside(dataset, table, chosen) if file not in without]
+            files = list(_beside(dataset, table, chosen, without))
         body = " UNION ALL ".join(_scans(dataset, schema, files, origin))
         connection.execute(f"CREATE {kind} beside_{table} AS {body or _nothing(schema, origin)}")
     for file in ("views.sql", "changes.sql", "card.sql"):
@@ -101,14 +101,16 @@ def _files_of(dataset: Dataset, table: str, policy: str | None) -> list[Path]:
     ]
 
 
-def _beside(dataset: Dataset, table: str, chosen: list[Path]) -> Iterator[Path]:
+def _beside(
+    dataset: Dataset, table: str, chosen: list[Path], without: Collection[Path]
+) -> Iterator[Path]:
     """Every file of a table but the chosen ones.
 
     A shard that is being made anew is for a moment in two places: then the current one counts.
     """
-    seen = {_identity(dataset, table, file) for file in chosen}
+    seen = {_identity(dataset, table, file) for file in chosen if file not in without}
     places = [dataset.files(table), *(dataset.files(table, of=of) for of in dataset.labellings())]
-    for file in dict.fromkeys(file for files in places for file in files):
+    for file in dict.fromkeys(file for files in places for file in files if file not in without):
         identity = _identity(dataset, table, file)
         if identity not in seen:
             seen.add(identity)

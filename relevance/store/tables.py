@@ -56,6 +56,8 @@ class Column:
     unit: str
     meaning: str
     nullable: bool = False
+    since: int = 1
+    """The version of the table that it came with."""
     fields: tuple[Mapping[str, Any], ...] = ()
     """Name, unit and meaning of the fields of a STRUCT."""
 
