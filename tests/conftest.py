@@ -14,6 +14,7 @@ import pytest
 from relevance.pipeline import (
     Counts,
     DatasetConfig,
+    Work,
     finish,
     generate_shard,
     label_shard,
@@ -76,6 +77,14 @@ def complete(root: Path, config: DatasetConfig = GROWN, policy: str | None = Non
             label_shard(root, config, spec, predicate, policy=policy)
     finish(root)
     return root
+
+
+def done(*works: Work) -> None:
+    """Do the jobs of some work one after the other."""
+    for work in works:
+        for job in work.jobs:
+            job.run()
+        work.finish()
 
 
 @cache

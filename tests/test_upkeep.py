@@ -13,23 +13,26 @@ from typing import Any
 import duckdb
 import numpy as np
 import pytest
-from conftest import GROWN, complete, contents, grown_dataset, untouched
+from conftest import GROWN, complete, contents, done, grown_dataset, untouched
 
-from relevance import labels, pipeline
+from relevance import labels
 from relevance.cli import main
 from relevance.labels import POLICIES, label_rows, necessary, stored_scene
 from relevance.pipeline import (
     Counts,
     actual,
     append,
+    beyond_repair,
     estimate,
     integrity,
     label_shard,
     labelled,
+    labelling,
     load_config,
     merge,
+    missing,
     prepare,
-    repair,
+    preparing,
     settings,
     shards_of,
 )
@@ -99,7 +102,7 @@ def test_necessary_is_what_the_planner_cannot_do_without() -> None:
             others = frozenset(scene.names) - {name}
             without = plan(scene, goal, config=GROWN.planner, movable=others)
             assert verdict.relevant == (without.status != "solved")
-        made = label_rows(scenes[row["scene_id"]], row, "necessary", verdicts)
+        made = label_rows(scenes[row["scene_id"]], row, "necessary", GROWN.planner)
         assert {r["query"]: r["because"] for r in made} == {
             name: verdict.because for name, verdict in verdicts.items()
         }
@@ -131,7 +134,7 @@ def test_other_plans_take_the_place_and_the_old_ones_lie_beside(made: Path) -> N
     with pytest.raises(DatasetError, match=r"config\.planner\.max_actions: .* plan it anew"):
         prepare(made, config)
     prepare(made, config, replan=True)
-    assert [message for _, message in integrity(Dataset.open(made)) if "stale" in message]
+    assert list(integrity(Dataset.open(made))) == [], "nothing changes until all is made"
     with untouched(*images(made)):
         complete(made, config)
     assert check(made) == []
@@ -162,7 +165,7 @@ def test_other_plans_take_the_place_and_the_old_ones_lie_beside(made: Path) -> N
 
 def test_another_planner_version_asks_first(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = contents(made)
-    for module in (settings, labels):
+    for module in (settings, labels, preparing):
         monkeypatch.setattr(module, "PLANNER_VERSION", "next")
     with pytest.raises(DatasetError, match=r"planner_version: .* found 'next'; plan it anew"):
         prepare(made, GROWN)
@@ -191,7 +194,9 @@ def test_another_goal_set(made: Path) -> None:
 
 def test_unknown_policies_are_named(made: Path) -> None:
     spec = shards_of(Dataset.open(made))[0]
-    with pytest.raises(ValueError, match=f"policy 'x': expected one of {', '.join(POLICIES)}"):
+    with pytest.raises(
+        ValueError, match=f"unknown policy 'x', expected one of {', '.join(POLICIES)}"
+    ):
         label_shard(made, GROWN, spec, spec.predicates[0], policy="x")
 
 
@@ -345,9 +350,12 @@ def test_every_breakage_is_named_and_made_good(made: Path, breakage: str) -> Non
     break_it(made)
     named = [breach.file for breach in check(made, render=False)]
     assert name in named
-    assert repair(made, named) == []
-    complete(made)
-    assert contents(made) == before
+    assert beyond_repair(made, named) == {}
+    for work in missing(made, named):
+        done(work)
+    after = contents(made)
+    assert {name: after.get(name) for name in before} == before
+    assert [n for n in after if n not in before and "planner=0" not in n] == []
     assert check(made, render=False) == []
 
 
@@ -502,8 +510,8 @@ def test_finished_labels_need_no_worker(made: Path, monkeypatch: pytest.MonkeyPa
     def no_work(*_: Any, **__: Any) -> None:
         raise AssertionError("nothing is left to do")
 
-    monkeypatch.setattr(pipeline.shards, "_compile", no_work)
-    monkeypatch.setattr(pipeline.shards, "plan", no_work)
+    monkeypatch.setattr(labelling, "compiled", no_work)
+    monkeypatch.setattr(labelling, "plan", no_work)
     dataset = Dataset.open(made)
     for spec in prepare(made, GROWN):
         assert all(labelled(dataset, GROWN, spec, p) for p in spec.predicates)

@@ -16,7 +16,7 @@ from relevance.pipeline.preparing import change_over, clear, labelling_of, resum
 from relevance.pipeline.scenes import generated
 from relevance.pipeline.settings import ShardSpec, load_config, shards_of
 from relevance.scene import PREDICATES
-from relevance.store import Dataset, DatasetError, Labelling, sql
+from relevance.store import TABLES, Dataset, DatasetError, Labelling
 
 REFUSED_SHARE = 0.01
 """Share of the replayed plans that the replay may refuse."""
@@ -67,16 +67,25 @@ def refused(dataset: Dataset) -> str | None:
 
     Then those plans that were not replayed cannot be believed either.
     """
-    _, [(replayed, bad)] = sql(
-        dataset.path,
-        "select count(replay_ok), count(*) filter (not replay_ok) from plans",
-    )
+    files = [file for table in TABLES for file in dataset.files(table)] + dataset.files_beside()
+    unreadable = {file for file in files if _cut(dataset, file)}
+    with dataset.connect(without=unreadable) as connection:
+        query = "select count(replay_ok), count(*) filter (not replay_ok) from plans"
+        [(replayed, bad)] = connection.execute(query).fetchall()
     if bad <= max(REFUSED_LEAST, REFUSED_SHARE * replayed):
         return None
     return (
         f"the replay refuses {bad} of {replayed} plans, expected at most {REFUSED_SHARE:.0%}; "
         "planner and replay disagree about these scenes, so do not trust the other plans"
     )
+
+
+def _cut(dataset: Dataset, file: Path) -> bool:
+    try:
+        dataset.metadata(file)
+    except DatasetError:
+        return True  # named by whoever reads it
+    return False
 
 
 def _missing(dataset: Dataset, spec: ShardSpec, predicate: str) -> list[Path]:
@@ -161,6 +170,8 @@ def broken(dataset: Dataset, named: Iterable[str]) -> tuple[dict[Key, set[str]],
         top, keys = parts[0], dataset.file_keys(dataset.path / name)
         spec = listed.get((keys.get("split", ""), keys.get("shard", -1)))
         table = parts[3] if top == "beside" and len(parts) > 3 else top
+        if table == "compacted":
+            continue  # gathered again from the labels
         if table not in ("scenes", "images", "plans", "timings", "labels") or spec is None:
             left[name] = "nothing makes it anew"
             continue

@@ -22,7 +22,7 @@ from relevance.pipeline.scenes import generate_shard, generated, try_out
 from relevance.pipeline.settings import DatasetConfig, ShardReport, ShardSpec, load_config
 from relevance.pipeline.upkeep import broken, finish, refused
 from relevance.scene import PREDICATES
-from relevance.store import Dataset, DatasetError, absolute
+from relevance.store import Dataset, DatasetError, absolute, compact
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,6 +169,7 @@ def missing(root: str | Path, named: Iterable[str] = ()) -> Iterator[Work]:
     root = absolute(root)
     dataset = resumed(root)
     config = load_config(dataset)
+    named = list(named)
     anew, _ = broken(dataset, named)
     specs = prepare(root, config, scenes_only=True)
     shards = {(split, shard) for split, shard, predicate, _ in anew if predicate is None}
@@ -194,6 +195,8 @@ def missing(root: str | Path, named: Iterable[str] = ()) -> Iterator[Work]:
         }
         if predicates:
             yield _labels(root, config, specs, predicates, policy, mine)
+    if any(Path(name).parts[0] == "compacted" for name in named):
+        compact(Dataset.open(root))
 
 
 def beyond_repair(root: str | Path, named: Iterable[str]) -> dict[str, str]:
