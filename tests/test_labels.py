@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -157,7 +158,7 @@ def test_a_policy_from_outside_is_found_by_name() -> None:
     class Nothing:
         plans = False
 
-        def verdicts(self, scene: dict, plan: dict, config: object) -> dict[str, Verdict]:
+        def verdicts(self, scene: Any, plan: Any, config: Any) -> dict[str, Verdict]:
             return {box["name"]: Verdict(relevant=False, because="no") for box in scene["objects"]}
 
     POLICIES.register("nothing", Nothing())

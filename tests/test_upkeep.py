@@ -213,7 +213,7 @@ def test_appending(made: Path) -> None:
     after = contents(made)
     assert [n for n in before if n != "dataset.json" and after[n] != before[n]] == []
     assert check(made) == []
-    with pytest.raises(DatasetError, match="expected at least 1 in all"):
+    with pytest.raises(DatasetError, match="expected at least 1 scene in all"):
         append(made, "train")
     with pytest.raises(DatasetError, match="split 'dev': expected one of train"):
         append(made, "dev", on=1)
