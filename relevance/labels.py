@@ -10,17 +10,17 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from relevance.hashing import content_hash
 from relevance.planner import PLANNER_VERSION, PlannerConfig, PlanResult, plan
+from relevance.registry import Registry
+from relevance.sampling import SAMPLER_VERSION
 from relevance.scene import Scene, scene_from_json, scene_to_json
-from relevance.simulation import Rendering, Replay
+from relevance.simulation import RENDERER_VERSION, Rendering, Replay
 
-POLICIES = ("found", "necessary", "any-minimal")
-"""`found`: relevant is what the plan that was found manipulates (the paper's Z_S).
-`necessary`: relevant is what no plan of the allowed length can do without (leave one out).
-`any-minimal`: relevant is what some plan of the least length manipulates."""
+LABELS_VERSION = "1"
+"""Raised when equal plans give other rows here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,6 +29,62 @@ class Verdict:
 
     relevant: bool
     because: str
+
+
+class Policy(Protocol):
+    """A way to read relevance off a plan that holds."""
+
+    plans: bool
+    """Whether it plans again, which takes time."""
+
+    def verdicts(
+        self, scene: Mapping[str, Any], plan: Mapping[str, Any], config: PlannerConfig
+    ) -> Mapping[str, Verdict]:
+        """A verdict on every object of a row of `scenes`, from a row of `plans` that holds."""
+        ...
+
+
+POLICIES: Registry[Policy] = Registry("policy")
+"""Label policies by name."""
+
+
+class _Found:
+    """Relevant is what the plan that was found manipulates (the paper's Z_S)."""
+
+    plans = False
+
+    def verdicts(
+        self, scene: Mapping[str, Any], plan: Mapping[str, Any], config: PlannerConfig
+    ) -> Mapping[str, Verdict]:
+        # the plan's own row says why
+        return {n: Verdict(relevant=n in plan["moved"], because="") for n in _names(scene)}
+
+
+class _Necessary:
+    """Relevant is what no plan of the allowed length can do without (leave one out)."""
+
+    plans = True
+
+    def verdicts(
+        self, scene: Mapping[str, Any], plan: Mapping[str, Any], config: PlannerConfig
+    ) -> Mapping[str, Verdict]:
+        return necessary(stored_scene(scene), plan, config)
+
+
+class _AnyMinimal:
+    """Relevant is what some plan of the least length manipulates."""
+
+    plans = False
+
+    def verdicts(
+        self, scene: Mapping[str, Any], plan: Mapping[str, Any], config: PlannerConfig
+    ) -> Mapping[str, Verdict]:
+        return {name: _in_any(name, plan) for name in _names(scene)}
+
+
+POLICIES.register("found", _Found())
+POLICIES.register("necessary", _Necessary())
+POLICIES.register("any-minimal", _AnyMinimal())
 
 
 def necessary(scene: Scene, found: Mapping[str, Any], config: PlannerConfig) -> dict[str, Verdict]:
@@ -91,6 +147,8 @@ def scene_row(
         "light": body["light"],
         "robot": body["robot"],
         "config_hash": config_hash,
+        "sampler_version": SAMPLER_VERSION,
+        "renderer_version": RENDERER_VERSION,
     }
 
 
@@ -122,8 +180,15 @@ def plan_row(
     *,
     config_hash: str,
 ) -> dict[str, Any]:
-    """The row of a goal in `plans`; a plan that was not found keeps its reason."""
-    solved = result.status == "solved"
+    """The row of a goal in `plans`; a plan that was not found keeps its reason.
+
+    A plan that the replay refuses is kept with the replay's reason; it is not solved and gets no
+    label.
+    """
+    found = result.status in ("solved", "refused")
+    refused = found and replay is not None and not replay.ok
+    status = "refused" if refused else result.status
+    reason = replay.reason if replay is not None and refused else result.reason
     return {
         "plan_id": plan_id(scene.id, str(result.goal), config_hash=config_hash),
         "scene_id": scene.id,
@@ -132,8 +197,8 @@ def plan_row(
         "predicate": result.goal.predicate.name,
         "subject": result.goal.subject,
         "reference": result.goal.reference,
-        "status": result.status,
-        "reason": result.reason,
+        "status": status,
+        "reason": reason,
         "actions": [action.to_list() for action in result.actions],
         "moved": list(result.moved),
         "alternatives": [list(names) for names in result.alternatives],
@@ -142,18 +207,18 @@ def plan_row(
             for name, pose in sorted(result.final.items())
         ],
         "n_actions": len(result.actions),
-        "cost": _number(result.cost) if solved else None,
+        "cost": _number(result.cost) if found else None,
         "ambiguous": result.ambiguous,
         "nodes": result.counts.nodes,
         "pose_checks": result.counts.pose,
         "keyframe_nlps": result.counts.keyframe,
         "path_nlps": result.counts.path,
-        "check_ok": solved and result.check_ok,
-        "max_penetration": _number(result.max_penetration) if solved else None,
+        "check_ok": found and result.check_ok,
+        "max_penetration": _number(result.max_penetration) if found else None,
         "replay_ok": None if replay is None else replay.ok,
         "replay_max_penetration": None if replay is None else _number(replay.max_penetration),
         "replay_reason": None if replay is None else replay.reason,
-        "holds": solved and result.check_ok and (replay is None or replay.ok),
+        "holds": status == "solved" and result.check_ok,
         "planner_version": PLANNER_VERSION,
         "config_hash": config_hash,
     }
@@ -178,26 +243,18 @@ def label_rows(
     scene: Mapping[str, Any],
     plan: Mapping[str, Any],
     policy: str = "found",
-    verdicts: Mapping[str, Verdict] | None = None,
+    config: PlannerConfig | None = None,
 ) -> list[dict[str, Any]]:
     """One row an object of the scene, in its order; none when the plan does not hold.
 
-    `scene` and `plan` are rows of `scenes` and `plans`; policy `necessary` takes the verdicts of
-    `necessary`. Raises ValueError for another policy.
+    `scene` and `plan` are rows of `scenes` and `plans`; policies that plan do it with `config`.
+    Raises RelevanceError for an unknown policy.
     """
-    if policy not in POLICIES:
-        raise ValueError(f"policy {policy!r}: expected one of {', '.join(POLICIES)}")
+    by = POLICIES[policy]
     assert plan["scene_id"] == scene["scene_id"], "a plan is labelled with its own scene"
     if not plan["holds"]:
         return []
-    names = [box["name"] for box in scene["objects"]]
-    if policy == "necessary":
-        assert verdicts is not None, "necessary takes the verdicts of leaving one out"
-    elif policy == "any-minimal":
-        verdicts = {name: _in_any(name, plan) for name in names}
-    else:
-        # the plan's own row says why
-        verdicts = {name: Verdict(relevant=name in plan["moved"], because="") for name in names}
+    verdicts = by.verdicts(scene, plan, config or PlannerConfig())
     goal_objects = (plan["subject"], plan["reference"])
     return [
         {
@@ -211,6 +268,10 @@ def label_rows(
         }
         for box in scene["objects"]
     ]
+
+
+def _names(scene: Mapping[str, Any]) -> list[str]:
+    return [box["name"] for box in scene["objects"]]
 
 
 def _in_any(name: str, plan: Mapping[str, Any]) -> Verdict:

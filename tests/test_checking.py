@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import pyarrow.parquet as pq
 import pytest
-from test_pipeline import CONFIG, small_dataset
+from conftest import CONFIG, small_dataset
 
 from relevance.pipeline import prepare
 from relevance.pipeline.checking import Breach, check, rules
@@ -26,14 +26,6 @@ SCENES_FILE = "scenes/split=train/shard-000000.parquet"
 IMAGES_FILE = "images/split=train/shard-000000.tar"
 PLANS_FILE = "plans/predicate=behind/split=train/shard-000000.parquet"
 LABELS_FILE = "labels/predicate=behind/split=train/shard-000000.parquet"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _cleanup() -> Iterator[None]:
-    yield
-    if small_dataset.cache_info().currsize:
-        shutil.rmtree(small_dataset().parent)
-        small_dataset.cache_clear()
 
 
 @pytest.fixture

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from relevance.labels import (
+    POLICIES,
+    Verdict,
     label_rows,
     plan_id,
     plan_row,
@@ -142,6 +145,32 @@ def test_only_plans_that_hold_are_labelled(
     assert len(label_rows(row_of(four()), plan)) == (4 if holds else 0)
 
 
+def test_a_plan_that_the_replay_refuses_is_not_solved() -> None:
+    plan = plan_of(found(), Replay(ok=False, max_penetration=0.004, reason="red in green"))
+    assert (plan["status"], plan["reason"], plan["holds"]) == ("refused", "red in green", False)
+    assert plan["actions"], "it is kept, to be looked at"
+    assert label_rows(row_of(four()), plan) == []
+    again = plan_of(found(), Replay(ok=True, max_penetration=0.0, reason=""))
+    assert (again["status"], again["reason"]) == ("solved", "")
+
+
+def test_a_policy_from_outside_is_found_by_name() -> None:
+    class Nothing:
+        plans = False
+
+        def verdicts(self, scene: Any, plan: Any, config: Any) -> dict[str, Verdict]:
+            return {box["name"]: Verdict(relevant=False, because="no") for box in scene["objects"]}
+
+    POLICIES.register("nothing", Nothing())
+    try:
+        rows = label_rows(row_of(four()), plan_of(found()), "nothing")
+    finally:
+        POLICIES.unregister("nothing")
+    assert {(row["policy"], row["relevant"], row["because"]) for row in rows} == {
+        ("nothing", False, "no")
+    }
+
+
 def test_a_failure_keeps_its_reason_and_has_no_numbers(tmp_path: Path) -> None:
     plan = plan_of(refused())
     assert plan["status"] == "infeasible"
@@ -188,7 +217,7 @@ def test_plan_ids_name_scene_goal_and_settings() -> None:
 
 
 def test_unknown_policy() -> None:
-    with pytest.raises(ValueError, match="policy 'guess': expected one of found"):
+    with pytest.raises(ValueError, match="unknown policy 'guess', expected one of found"):
         label_rows(row_of(four()), plan_of(found()), "guess")
 
 

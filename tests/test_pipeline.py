@@ -9,15 +9,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import pytest
+from conftest import CONFIG, contents, make, small_dataset, untouched
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -28,62 +25,20 @@ from relevance.pipeline import (
     ShardSpec,
     generate_shard,
     label_shard,
+    labelling,
     load_config,
     prepare,
+    scenes,
     shard_specs,
-    shards,
 )
 from relevance.sampling import SceneConfig, sample_goals, sample_scene
 from relevance.scene import FAMILIES, PREDICATES
 from relevance.store import SPLITS, Dataset, DatasetError
 
-CONFIG = DatasetConfig(
-    seed=3,
-    train=Counts(same_plane=3, on=2),
-    validation=Counts(same_plane=1),
-    test=Counts(same_plane=1, on=1),
-    scenes_per_shard=2,
-    goals_per_scene=1,
-    scene=SceneConfig(max_objects=6),
-    replay_share=0.3,
-)
-
-
-def make(root: Path, config: DatasetConfig = CONFIG) -> Path:
-    """Make a whole dataset in this process."""
-    for spec in prepare(root, config):
-        generate_shard(root, config, spec)
-        for predicate in spec.predicates:
-            label_shard(root, config, spec, predicate)
-    return root
-
-
-@cache
-def small_dataset() -> Path:
-    """A finished dataset of CONFIG, made once; copy it before you change it."""
-    return make(Path(tempfile.mkdtemp(prefix="relevance-test-")) / "dataset")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _cleanup() -> Iterator[None]:
-    yield
-    if small_dataset.cache_info().currsize:
-        shutil.rmtree(small_dataset().parent)
-        small_dataset.cache_clear()
-
 
 @pytest.fixture
 def made(tmp_path: Path) -> Path:
     return Path(shutil.copytree(small_dataset(), tmp_path / "dataset"))
-
-
-def contents(root: Path) -> dict[str, bytes]:
-    """Every file that falls under the equal-bytes promise."""
-    return {
-        str(file.relative_to(root)): file.read_bytes()
-        for file in sorted(root.rglob("*"))
-        if file.is_file() and not {"timings", "durations"} & set(file.parts)
-    }
 
 
 # which shards ----------------------------------------------------------------------------------
@@ -139,10 +94,10 @@ def test_presets(preset: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"seed": -1}, "seed = -1: expected at least 0"),
-        ({"goals_per_scene": 0}, "goals_per_scene = 0: expected at least 1"),
+        ({"seed": -1}, "seed = -1: expected greater than or equal to 0"),
+        ({"goals_per_scene": 0}, "goals_per_scene = 0: expected greater than or equal to 1"),
         ({"scenes_per_shard": 0}, "scenes_per_shard = 0"),
-        ({"replay_share": 1.5}, "replay_share = 1.5: expected 0 to 1"),
+        ({"replay_share": 1.5}, "replay_share = 1.5: expected less than or equal to 1"),
         ({"policy": "guess"}, "policy = 'guess': expected one of found"),
     ],
 )
@@ -199,7 +154,7 @@ def test_a_broken_description(tmp_path: Path, change: dict, message: str) -> Non
     with pytest.raises(DatasetError, match=message):
         prepare(tmp_path, CONFIG)
     file.write_text("{}")
-    with pytest.raises(DatasetError, match=r"dataset.json: shards: expected there, found no such"):
+    with pytest.raises(DatasetError, match=r"dataset.json: config: expected there, found no such"):
         prepare(tmp_path, CONFIG)
 
 
@@ -239,7 +194,7 @@ def test_images_belong_to_their_rows() -> None:
 
 
 def test_settings_without_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shards, "ATTEMPTS", 3)
+    monkeypatch.setattr(scenes, "ATTEMPTS", 3)
     tight = replace(CONFIG, scene=SceneConfig(min_objects=10, reach=(0.30, 0.34), tries=2))
     spec = prepare(tmp_path, tight)[0]
     with pytest.raises(DatasetError, match=r"scene 0 of train: no draw in 3 was accepted"):
@@ -281,13 +236,6 @@ def test_another_seed_gives_other_bytes(tmp_path: Path) -> None:
 # resuming --------------------------------------------------------------------------------------
 
 
-@contextmanager
-def untouched(*files: Path) -> Iterator[None]:
-    before = [(file.stat().st_mtime_ns, file.stat().st_ino) for file in files]
-    yield
-    assert [(file.stat().st_mtime_ns, file.stat().st_ino) for file in files] == before
-
-
 def test_finished_shards_are_skipped(made: Path) -> None:
     files = [file for file in made.rglob("*") if file.is_file()]
     with untouched(*files):
@@ -324,7 +272,8 @@ def test_a_lost_shard_is_made_again(made: Path) -> None:
 def test_a_killed_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:
     program = (
         "import sys, time\nfrom pathlib import Path\nsys.path.insert(0, sys.argv[2])\n"
-        "from test_pipeline import CONFIG, prepare, generate_shard\n"
+        "from conftest import CONFIG\n"
+        "from relevance.pipeline import prepare, generate_shard\n"
         "root = Path(sys.argv[1])\n"
         "def wait(done, of):\n"
         "    print('half made', flush=True)\n"
@@ -363,8 +312,12 @@ def test_planning_anew_leaves_the_images(made: Path) -> None:
         report = label_shard(made, more, spec, "on")
     assert not report.skipped
     assert report.rows > spec.count
-    name = f"plans/predicate=on/split=test/shard-{spec.shard:06d}.parquet"
-    assert (made / name).read_bytes() != before[name]
+    name = f"predicate=on/split=test/shard-{spec.shard:06d}.parquet"
+    assert (made / "plans" / name).read_bytes() == before[f"plans/{name}"], "until all are made"
+    beside = dataset.shard_path(
+        "plans", split="test", shard=spec.shard, predicate="on", of=more.labelling
+    )
+    assert beside.read_bytes() != before[f"plans/{name}"]
 
 
 # labels ----------------------------------------------------------------------------------------
@@ -399,10 +352,10 @@ def test_every_solved_test_plan_is_replayed() -> None:
 
 def test_the_replayed_share_is_a_share() -> None:
     ids = [f"scene{i}" for i in range(4000)]
-    drawn = sum(shards._chosen(name, "on(a, b)", 0.1) for name in ids)
+    drawn = sum(labelling._chosen(name, "on(a, b)", 0.1) for name in ids)
     assert 330 < drawn < 470
-    assert not any(shards._chosen(name, "on(a, b)", 0.0) for name in ids)
-    assert all(shards._chosen(name, "on(a, b)", 1.0) for name in ids)
+    assert not any(labelling._chosen(name, "on(a, b)", 0.0) for name in ids)
+    assert all(labelling._chosen(name, "on(a, b)", 1.0) for name in ids)
 
 
 def test_labels_need_scenes_and_a_fitting_predicate(tmp_path: Path) -> None:

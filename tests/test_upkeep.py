@@ -6,84 +6,45 @@ import json
 import os
 import shutil
 import socket
-import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import duckdb
 import numpy as np
 import pytest
-from test_pipeline import contents, untouched
+from conftest import GROWN, complete, contents, done, grown_dataset, untouched
 
-from relevance import labels, pipeline
+from relevance import labels
 from relevance.cli import main
 from relevance.labels import POLICIES, label_rows, necessary, stored_scene
 from relevance.pipeline import (
     Counts,
-    DatasetConfig,
     actual,
     append,
+    beyond_repair,
     estimate,
-    finish,
-    generate_shard,
     integrity,
     label_shard,
     labelled,
+    labelling,
     load_config,
     merge,
+    missing,
     prepare,
-    repair,
+    preparing,
     settings,
     shards_of,
 )
 from relevance.pipeline.checking import check
 from relevance.pipeline.estimating import Estimate
 from relevance.planner import PlannerConfig, plan
-from relevance.sampling import SceneConfig
 from relevance.store import SCHEMAS, Dataset, DatasetError, compact, export, sql
-
-CONFIG = DatasetConfig(
-    seed=5,
-    train=Counts(same_plane=2, on=4),
-    test=Counts(on=2),
-    scenes_per_shard=2,
-    goals_per_scene=3,
-    scene=SceneConfig(max_objects=7),
-    replay_share=0.0,
-    test_replay_share=0.2,
-)
-
-
-def complete(root: Path, config: DatasetConfig = CONFIG, policy: str | None = None) -> Path:
-    """Generate and label whatever is missing, in this process."""
-    for spec in prepare(root, config):
-        generate_shard(root, config, spec)
-        for predicate in spec.predicates:
-            label_shard(root, config, spec, predicate, policy=policy)
-    finish(root)
-    return root
-
-
-@cache
-def small() -> Path:
-    """A finished dataset of CONFIG, made once; copy it before you change it."""
-    return complete(Path(tempfile.mkdtemp(prefix="relevance-test-")) / "dataset")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _cleanup() -> Iterator[None]:
-    yield
-    if small.cache_info().currsize:
-        shutil.rmtree(small().parent)
-        small.cache_clear()
 
 
 @pytest.fixture
 def made(tmp_path: Path) -> Path:
-    return Path(shutil.copytree(small(), tmp_path / "dataset"))
+    return Path(shutil.copytree(grown_dataset(), tmp_path / "dataset"))
 
 
 def images(root: Path) -> list[Path]:
@@ -129,19 +90,19 @@ def test_another_policy_lies_beside(made: Path, policy: str) -> None:
 
 
 def test_necessary_is_what_the_planner_cannot_do_without() -> None:
-    dataset = Dataset.open(small())
+    dataset = Dataset.open(grown_dataset())
     scenes = {row["scene_id"]: row for row in dataset.read_rows("scenes")}
     blocked = [p for p in dataset.read_rows("plans") if p["holds"] and len(p["moved"]) > 1]
     assert blocked, "expected plans that move a blocker"
     for row in blocked[:4]:
         scene = stored_scene(scenes[row["scene_id"]])
-        verdicts = necessary(scene, row, CONFIG.planner)
+        verdicts = necessary(scene, row, GROWN.planner)
         goal = f"{row['predicate']}({row['subject']}, {row['reference']})"
         for name, verdict in verdicts.items():
             others = frozenset(scene.names) - {name}
-            without = plan(scene, goal, config=CONFIG.planner, movable=others)
+            without = plan(scene, goal, config=GROWN.planner, movable=others)
             assert verdict.relevant == (without.status != "solved")
-        made = label_rows(scenes[row["scene_id"]], row, "necessary", verdicts)
+        made = label_rows(scenes[row["scene_id"]], row, "necessary", GROWN.planner)
         assert {r["query"]: r["because"] for r in made} == {
             name: verdict.because for name, verdict in verdicts.items()
         }
@@ -169,17 +130,17 @@ def test_any_minimal_is_the_union_of_the_alternatives() -> None:
 
 
 def test_other_plans_take_the_place_and_the_old_ones_lie_beside(made: Path) -> None:
-    before, config = contents(made), replace(CONFIG, planner=PlannerConfig(max_actions=2))
+    before, config = contents(made), replace(GROWN, planner=PlannerConfig(max_actions=2))
     with pytest.raises(DatasetError, match=r"config\.planner\.max_actions: .* plan it anew"):
         prepare(made, config)
     prepare(made, config, replan=True)
-    assert [message for _, message in integrity(Dataset.open(made)) if "stale" in message]
+    assert list(integrity(Dataset.open(made))) == [], "nothing changes until all is made"
     with untouched(*images(made)):
         complete(made, config)
     assert check(made) == []
     dataset = Dataset.open(made)
     [old] = dataset.labellings()
-    assert old == CONFIG.labelling
+    assert old == GROWN.labelling
     for table in ("plans", "labels"):
         for file in dataset.files(table, of=old):
             name = str(file.relative_to(made)).partition(f"/{table}/")[2]
@@ -193,9 +154,9 @@ def test_other_plans_take_the_place_and_the_old_ones_lie_beside(made: Path) -> N
     assert gone
     assert all(why.startswith("no plan that holds now: ") for why in gone)
     # and back: nothing is planned again
-    prepare(made, CONFIG, replan=True)
+    prepare(made, GROWN, replan=True)
     timings = {file: file.read_bytes() for file in dataset.files("timings", of=old)}
-    complete(made, CONFIG)
+    complete(made, GROWN)
     assert {name: c for name, c in contents(made).items() if name in before} == before
     again = {file: file.read_bytes() for file in dataset.files("timings")}
     assert sorted(again.values()) == sorted(timings.values())
@@ -204,12 +165,12 @@ def test_other_plans_take_the_place_and_the_old_ones_lie_beside(made: Path) -> N
 
 def test_another_planner_version_asks_first(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = contents(made)
-    for module in (settings, labels):
+    for module in (settings, labels, preparing):
         monkeypatch.setattr(module, "PLANNER_VERSION", "next")
     with pytest.raises(DatasetError, match=r"planner_version: .* found 'next'; plan it anew"):
-        prepare(made, CONFIG)
-    assert prepare(made, CONFIG, scenes_only=True), "scenes do not ask for the planner"
-    prepare(made, CONFIG, replan=True)
+        prepare(made, GROWN)
+    assert prepare(made, GROWN, scenes_only=True), "scenes do not ask for the planner"
+    prepare(made, GROWN, replan=True)
     complete(made)
     _, rows = sql(made, "select planner_version = 'next', current from labellings")
     assert sorted(rows) == [(False, False), (True, True)]
@@ -220,7 +181,7 @@ def test_another_planner_version_asks_first(made: Path, monkeypatch: pytest.Monk
 
 
 def test_another_goal_set(made: Path) -> None:
-    other = replace(CONFIG, goals_seed=77, goals_per_scene=1)
+    other = replace(GROWN, goals_seed=77, goals_per_scene=1)
     prepare(made, other, replan=True)
     complete(made, other)
     _, [(now, before)] = sql(
@@ -233,8 +194,10 @@ def test_another_goal_set(made: Path) -> None:
 
 def test_unknown_policies_are_named(made: Path) -> None:
     spec = shards_of(Dataset.open(made))[0]
-    with pytest.raises(ValueError, match=f"policy 'x': expected one of {', '.join(POLICIES)}"):
-        label_shard(made, CONFIG, spec, spec.predicates[0], policy="x")
+    with pytest.raises(
+        ValueError, match=f"unknown policy 'x', expected one of {', '.join(POLICIES)}"
+    ):
+        label_shard(made, GROWN, spec, spec.predicates[0], policy="x")
 
 
 # grown and merged ------------------------------------------------------------------------------
@@ -245,19 +208,19 @@ def test_appending(made: Path) -> None:
     append(made, "test", same_plane=1, on=1)
     config = load_config(Dataset.open(made))
     assert (config.test.same_plane, config.test.on) == (1, 3)
-    assert config.train == CONFIG.train
+    assert config.train == GROWN.train
     complete(made, config)
     after = contents(made)
     assert [n for n in before if n != "dataset.json" and after[n] != before[n]] == []
     assert check(made) == []
-    with pytest.raises(DatasetError, match="expected at least 1 in all"):
+    with pytest.raises(DatasetError, match="expected at least 1 scene in all"):
         append(made, "train")
     with pytest.raises(DatasetError, match="split 'dev': expected one of train"):
         append(made, "dev", on=1)
 
 
 def test_merging_by_reference(made: Path, tmp_path: Path) -> None:
-    other = complete(tmp_path / "other", replace(CONFIG, seed=6, train=Counts(on=3)))
+    other = complete(tmp_path / "other", replace(GROWN, seed=6, train=Counts(on=3)))
     files = [file for root in (made, other) for file in root.rglob("*") if file.is_file()]
     with untouched(*files):
         merged = merge([made, other], tmp_path / "both")
@@ -286,9 +249,9 @@ def test_merging_by_reference(made: Path, tmp_path: Path) -> None:
     )
     assert (count, policy) == (len(merged.read_rows("labels")), "any-minimal")
     with pytest.raises(DatasetError, match="is merged by reference; make shards in "):
-        label_shard(merged.path, CONFIG, shards_of(merged)[0], "behind")
+        label_shard(merged.path, GROWN, shards_of(merged)[0], "behind")
     # three: a merged one counts as its sources
-    third = complete(tmp_path / "third", replace(CONFIG, seed=7, train=Counts(on=1)))
+    third = complete(tmp_path / "third", replace(GROWN, seed=7, train=Counts(on=1)))
     assert len(merge([merged.path, third], tmp_path / "three").sources) == 3
 
 
@@ -307,7 +270,7 @@ def test_merging_refuses(made: Path, tmp_path: Path) -> None:
 
 
 def test_a_merged_dataset_names_what_is_broken_in_a_source(made: Path, tmp_path: Path) -> None:
-    other = complete(tmp_path / "other", replace(CONFIG, seed=6, train=Counts(on=1)))
+    other = complete(tmp_path / "other", replace(GROWN, seed=6, train=Counts(on=1)))
     merged = merge([made, other], tmp_path / "both")
     next(iter(Dataset.open(other).files("labels"))).unlink()
     assert {b.file for b in check(merged.path)} == {
@@ -341,7 +304,7 @@ def _stale_labels(root: Path) -> None:
     dataset = Dataset.open(root)
     where = {"split": "train", "shard": 1, "predicate": "on"}
     rows = [{**row, "planner_version": "0"} for row in dataset.read_rows("labels", **where)]
-    made_by = {**CONFIG.labelling.made_by, "planner": "0"}
+    made_by = {**GROWN.labelling.made_by, "planner": "0"}
     dataset.write_rows("labels", rows, made_by=made_by, **where)
 
 
@@ -386,9 +349,12 @@ def test_every_breakage_is_named_and_made_good(made: Path, breakage: str) -> Non
     break_it(made)
     named = [breach.file for breach in check(made, render=False)]
     assert name in named
-    assert repair(made, named) == []
-    complete(made)
-    assert contents(made) == before
+    assert beyond_repair(made, named) == {}
+    for work in missing(made, named):
+        done(work)
+    after = contents(made)
+    assert {name: after.get(name) for name in before} == before
+    assert [n for n in after if n not in before and "planner=0" not in n] == []
     assert check(made, render=False) == []
 
 
@@ -404,7 +370,7 @@ def test_labels_beside_are_checked_too(made: Path) -> None:
     assert check(made, render=False) == []
     # one of another policy in its place
     keys = {key: dataset.file_keys(file)[key] for key in ("predicate", "split", "shard")}
-    other, made_by = dataset.read_rows("labels", **keys), CONFIG.labelling.made_by
+    other, made_by = dataset.read_rows("labels", **keys), GROWN.labelling.made_by
     dataset.write_rows("labels", other, of=of, made_by=made_by, **keys)
     [breach] = check(made, render=False)
     assert breach.message == "stale: expected policy any-minimal as its folder says, found found"
@@ -429,10 +395,10 @@ def test_a_dead_writers_file_is_swept_and_a_living_ones_is_not(made: Path) -> No
     elsewhere = folder / ".shard-000009.parquet.another-1-abcdef.tmp"
     for file in (dead, alive, elsewhere):
         file.write_bytes(b"half")
-    prepare(made, CONFIG)
+    prepare(made, GROWN)
     assert [dead.exists(), alive.exists(), elsewhere.exists()] == [False, True, True]
     os.utime(elsewhere, (0, 0))
-    prepare(made, CONFIG)
+    prepare(made, GROWN)
     assert not elsewhere.exists()
 
 
@@ -483,7 +449,7 @@ def test_export_loads_with_datasets(made: Path, tmp_path: Path) -> None:
 
 
 def test_an_estimate_is_close_and_kept(made: Path, tmp_path: Path) -> None:
-    many = replace(CONFIG, train=Counts(same_plane=20, on=40), test=Counts(on=20))
+    many = replace(GROWN, train=Counts(same_plane=20, on=40), test=Counts(on=20))
     found = estimate(many, sample=4)
     assert found.quantities.scenes == 80
     real = actual(made)
@@ -521,7 +487,7 @@ def test_estimate_command_before_and_after(
 
 def test_plain_duckdb_sees_what_changed(made: Path) -> None:
     complete(made, policy="any-minimal")
-    config = replace(CONFIG, planner=PlannerConfig(max_actions=2))
+    config = replace(GROWN, planner=PlannerConfig(max_actions=2))
     prepare(made, config, replan=True)
     complete(made, config)
     with duckdb.connect() as plain:
@@ -540,10 +506,10 @@ def test_finished_labels_need_no_worker(made: Path, monkeypatch: pytest.MonkeyPa
     def no_work(*_: Any, **__: Any) -> None:
         raise AssertionError("nothing is left to do")
 
-    monkeypatch.setattr(pipeline.shards, "_compile", no_work)
-    monkeypatch.setattr(pipeline.shards, "plan", no_work)
+    monkeypatch.setattr(labelling, "compiled", no_work)
+    monkeypatch.setattr(labelling, "plan", no_work)
     dataset = Dataset.open(made)
-    for spec in prepare(made, CONFIG):
-        assert all(labelled(dataset, CONFIG, spec, p) for p in spec.predicates)
+    for spec in prepare(made, GROWN):
+        assert all(labelled(dataset, GROWN, spec, p) for p in spec.predicates)
     with untouched(*(file for file in made.rglob("*") if file.is_file())):
         assert main(["label", str(made), "--workers", "1"]) == 0

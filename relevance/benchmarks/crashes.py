@@ -25,8 +25,8 @@ from relevance.pipeline import (
     finish,
     generate_shard,
     label_shard,
+    missing,
     prepare,
-    repair,
 )
 from relevance.pipeline.checking import check
 
@@ -262,7 +262,10 @@ def break_file(
     else:
         file.unlink()
     named = [breach.file for breach in check(root, render=False)]
-    repair(root, named)
+    for work in missing(root, named):
+        for job in work.jobs:
+            job.run()
+        work.finish()
     return Trial(
         number=number,
         what=f"{how} {Path(name).parts[0]}",

@@ -220,7 +220,7 @@ def _repair(_: Preset) -> Callable[..., int]:
             dataset: Folder of the dataset.
             workers: Processes that work at a time.
         """
-        from relevance.pipeline import missing, repair
+        from relevance.pipeline import beyond_repair, missing
         from relevance.pipeline.checking import check
 
         check_workers(workers)
@@ -228,8 +228,9 @@ def _repair(_: Preset) -> Callable[..., int]:
             named = [breach.file for breach in check(dataset, progress=progress)]
         for name in dict.fromkeys(named):
             say(f"broken: {name}")
-        repair(dataset, named)
-        for work in missing(dataset):
+        for name, why in beyond_repair(dataset, named).items():
+            say(f"left as it is: {name}: {why}")
+        for work in missing(dataset, named):
             make("shards made anew", work, workers)
         with bar("files checked") as progress:
             left = check(dataset, progress=progress)

@@ -2,34 +2,35 @@
 
 from relevance.pipeline.doing import Made, do
 from relevance.pipeline.estimating import Estimate, Quantities, actual, estimate
+from relevance.pipeline.labelling import label_shard, labelled
 from relevance.pipeline.merging import merge
+from relevance.pipeline.preparing import append, describe, prepare
+from relevance.pipeline.scenes import ATTEMPTS, draw, generate_shard, generated
 from relevance.pipeline.settings import (
     LAYOUT,
     Counts,
     DatasetConfig,
     ShardReport,
     ShardSpec,
-    append,
-    describe,
     load_config,
-    prepare,
     shard_specs,
     shards_of,
 )
-from relevance.pipeline.shards import (
-    ATTEMPTS,
-    draw,
-    generate_shard,
-    generated,
-    label_shard,
-    labelled,
+from relevance.pipeline.upkeep import REFUSED_LEAST, REFUSED_SHARE, finish, integrity
+from relevance.pipeline.work import (
+    Job,
+    Work,
+    beyond_repair,
+    labels_work,
+    missing,
+    scenes_work,
 )
-from relevance.pipeline.upkeep import finish, integrity, repair
-from relevance.pipeline.work import Job, Work, labels_work, missing, scenes_work
 
 __all__ = [
     "ATTEMPTS",
     "LAYOUT",
+    "REFUSED_LEAST",
+    "REFUSED_SHARE",
     "Counts",
     "DatasetConfig",
     "Estimate",
@@ -41,6 +42,7 @@ __all__ = [
     "Work",
     "actual",
     "append",
+    "beyond_repair",
     "describe",
     "do",
     "draw",
@@ -56,7 +58,6 @@ __all__ = [
     "merge",
     "missing",
     "prepare",
-    "repair",
     "scenes_work",
     "shard_specs",
     "shards_of",

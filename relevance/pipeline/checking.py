@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from relevance.labels import stored_scene
-from relevance.pipeline import ShardSpec, integrity, load_config, shards_of
+from relevance.pipeline.settings import ShardSpec, load_config, shards_of
+from relevance.pipeline.upkeep import integrity, refused
 from relevance.scene import (
     Pose,
     Scene,
@@ -28,7 +29,7 @@ from relevance.scene import (
     scene_from_json,
 )
 from relevance.simulation import Renderer
-from relevance.store import MEMBERS, SCHEMAS, TABLES, Dataset, DatasetError
+from relevance.store import MEMBERS, SCHEMAS, TABLES, Dataset, DatasetError, table_schema
 
 PER_RULE = 20
 """Breaches of one rule that are listed; the rest is counted."""
@@ -56,16 +57,21 @@ class Breach:
 
 
 def check(
-    root: str | Path, *, render: bool = True, progress: Progress | None = None
+    root: str | Path,
+    *,
+    render: bool = True,
+    strict: bool = False,
+    progress: Progress | None = None,
 ) -> list[Breach]:
     """Every contract of a dataset; an empty list when it keeps them all.
 
-    `render` renders one scene of each shard again and compares pixels. Raises DatasetError only
-    when there is no dataset at all.
+    `render` renders one scene of each shard again and compares pixels. `strict` names files of
+    older schema versions too, which are read with nulls for younger columns. Raises DatasetError
+    only when there is no dataset at all.
     """
     dataset = Dataset.open(root)
     if dataset.sources:
-        return _merged(dataset, render, progress)
+        return _merged(dataset, render, strict, progress)
     breaches = list(_description(dataset))
     breaches += [Breach(file=file, message=message) for file, message in integrity(dataset)]
     files = [file for table in TABLES for file in dataset.files(table)]
@@ -75,6 +81,8 @@ def check(
     for done, file in enumerate(files, 1):
         try:
             found = list(_file(dataset, file, dataset.read_file(file)))
+            if strict:
+                found += _version(dataset, file)
         except DatasetError as error:
             found = [_unreadable(dataset, file, error)]
             unreadable.add(file)
@@ -89,15 +97,19 @@ def check(
     whole = [file for file in dataset.files("scenes") if file not in odd]
     breaches += _scenes(dataset, whole, render)
     breaches += _goals(dataset, left_out)
+    if not unreadable and (problem := refused(dataset)):
+        breaches.append(Breach(file="plans", column="replay_ok", message=problem))
     return breaches
 
 
-def _merged(dataset: Dataset, render: bool, progress: Progress | None) -> list[Breach]:
+def _merged(
+    dataset: Dataset, render: bool, strict: bool, progress: Progress | None
+) -> list[Breach]:
     """Every contract of a merged dataset: those of its sources, and those between them."""
     breaches: list[Breach] = []
     for source in dataset.sources:
         there = source.dataset
-        for breach in check(there.path, render=render, progress=progress):
+        for breach in check(there.path, render=render, strict=strict, progress=progress):
             name = dataset.name_of(there.path / breach.file)
             breaches.append(replace(breach, file=name))
     # a file that cannot be read stops every query; it has been named
@@ -130,6 +142,16 @@ def _unreadable(dataset: Dataset, file: Path, error: DatasetError) -> Breach:
         column=column[1] if column else None,
         message=text[column.end() :] if column else text,
     )
+
+
+def _version(dataset: Dataset, file: Path) -> Iterator[Breach]:
+    stored = dataset.metadata(file)
+    expected = str(table_schema(stored["table"]).version)
+    if stored["version"] != expected:
+        yield Breach(
+            file=_name(dataset, file),
+            message=f"expected version {expected} of the schema, found {stored['version']}",
+        )
 
 
 def _file(dataset: Dataset, file: Path, body: Any) -> Iterator[Breach]:

@@ -14,15 +14,16 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from relevance.pipeline.labelling import label_shard
+from relevance.pipeline.preparing import prepare
+from relevance.pipeline.scenes import generate_shard
 from relevance.pipeline.settings import (
     Counts,
     DatasetConfig,
     ShardReport,
     ShardSpec,
-    prepare,
     shard_specs,
 )
-from relevance.pipeline.shards import generate_shard, label_shard
 from relevance.scene import FAMILIES
 from relevance.store import SPLITS, Dataset, empty_size, locate, replacing, sql
 
@@ -106,7 +107,7 @@ def estimate(
     that split. Nothing of it is kept.
     """
     split_sizes = {"train": sample - sample // 4, "validation": 0, "test": sample // 4}
-    counts = {split: Counts(same_plane=n, on=n) for split, n in split_sizes.items()}
+    counts = {split: Counts.each(n) for split, n in split_sizes.items()}
     # several units of work a process, so that all processes are busy nearly to the end
     size = max(1, math.ceil(split_sizes["train"] / (2 * workers)))
     small = replace(config, scenes_per_shard=size, **counts)

@@ -8,13 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from relevance.pipeline.settings import (
-    Counts,
-    ShardSpec,
-    describe,
-    load_config,
-    shards_of,
-)
+from relevance.pipeline.preparing import describe
+from relevance.pipeline.settings import Counts, ShardSpec, load_config, shards_of
 from relevance.store import SPLITS, Dataset, DatasetError, absolute, is_remote
 
 
@@ -58,11 +53,10 @@ def merge(sources: Sequence[str | Path], into: str | Path) -> Dataset:
             scenes[split] += sum(spec.count for spec in mine if spec.split == split)
     config = load_config(head)
     for split in SPLITS:
-        counts = [load_config(dataset).counts(split) for dataset in datasets]
-        same_plane, on = sum(c.same_plane for c in counts), sum(c.on for c in counts)
-        config = replace(config, **{split: Counts(same_plane=same_plane, on=on)})
+        counts = Counts.total(load_config(dataset).counts(split) for dataset in datasets)
+        config = replace(config, **{split: counts})
     description = describe(config, specs)
-    for key in ("planner_version", "tables"):
+    for key in ("planner_version", "tables", "versions"):
         description[key] = head.description.get(key)
     # Seeds differ, and so do the hashes of the settings: each source is held to its own.
     description["hashes"] = {}
@@ -91,7 +85,7 @@ def _way(target: Path, source: Path) -> str:
 
 def _same(head: Dataset, other: Dataset) -> None:
     """Raises DatasetError unless two datasets have equal schemas and ways of labelling."""
-    for key in ("layout", "tables", "planner_version"):
+    for key in ("layout", "planner_version"):
         found, expected = other.description.get(key), head.description.get(key)
         if found != expected:
             raise DatasetError(

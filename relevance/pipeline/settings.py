@@ -1,4 +1,4 @@
-"""What a dataset is made of: its settings, its presets, its shards, and dataset.json.
+"""What a dataset is made of: its settings, its presets, its shards.
 
 A shard is one unit of work and depends on (config, spec) alone: equal bytes whatever worker
 makes it, in whatever order.
@@ -6,55 +6,66 @@ makes it, in whatever order.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError, field_validator
 
-from relevance.hashing import content_hash
-from relevance.labels import POLICIES
+from relevance.configs import ConfigError, config, identity_hash
+from relevance.labels import LABELS_VERSION, POLICIES
 from relevance.planner import PLANNER_VERSION, PlannerConfig
-from relevance.sampling import GoalConfig, SceneConfig
+from relevance.sampling import SAMPLER_VERSION, GoalConfig, SceneConfig
 from relevance.scene import FAMILIES, PREDICATES, Predicate
-from relevance.store import (
-    SPLITS,
-    TABLES,
-    Dataset,
-    DatasetError,
-    Labelling,
-    differences,
-    locate,
-    sweep,
-    table_schema,
-)
+from relevance.simulation import RENDERER_VERSION
+from relevance.store import SPLITS, Dataset, DatasetError, Labelling
 
 LAYOUT = 1
 """Version of dataset.json."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+Natural = Annotated[int, Field(ge=0)]
+Positive = Annotated[int, Field(ge=1)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+@config
 class Counts:
-    """Number of scenes of each family in one split."""
+    """Number of scenes of each family in one split: one field a family of `scene.FAMILIES`."""
 
-    same_plane: int = 0
-    on: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("same_plane", "on"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"Counts.{name} = {getattr(self, name)}: expected at least 0")
+    same_plane: Natural = 0
+    on: Natural = 0
 
     def of(self, family: str) -> int:
         """Number of scenes of a family."""
-        return self.on if family == "on" else self.same_plane
+        return getattr(self, _field(family))
+
+    @classmethod
+    def by_family(cls, counts: Mapping[str, int]) -> Counts:
+        """Counts from the families' names."""
+        return cls(**{_field(family): count for family, count in counts.items()})
+
+    @classmethod
+    def each(cls, count: int) -> Counts:
+        """That many scenes of every family."""
+        return cls.by_family(dict.fromkeys(FAMILIES, count))
+
+    @classmethod
+    def total(cls, parts: Iterable[Counts]) -> Counts:
+        """The sum of several."""
+        several = list(parts)
+        return cls.by_family({f: sum(counts.of(f) for counts in several) for f in FAMILIES})
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+def _field(family: str) -> str:
+    return family.replace("-", "_")
+
+
+@config
 class DatasetConfig:
-    """What a dataset is made of; raises ValueError that names the field."""
+    """What a dataset is made of; raises ConfigError that names the field."""
 
-    seed: int = 0
+    seed: Natural = 0
     """Seed of everything that is drawn."""
     train: Counts = field(default_factory=Counts)
     """Scenes to train on."""
@@ -62,9 +73,9 @@ class DatasetConfig:
     """Scenes to choose by."""
     test: Counts = field(default_factory=Counts)
     """Scenes that only evaluation sees."""
-    scenes_per_shard: int = 100
+    scenes_per_shard: Positive = 100
     """Scenes in one unit of work."""
-    goals_per_scene: int = 3
+    goals_per_scene: Positive = 3
     """Goals drawn for each scene and predicate."""
     scene: SceneConfig = field(default_factory=SceneConfig)
     """How scenes are drawn; `family` is set by the shard."""
@@ -72,48 +83,57 @@ class DatasetConfig:
     """Which pairs of objects goals are asked of."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     """How goals are planned."""
-    replay_share: float = 0.02
+    replay_share: Share = 0.02
     """Share of the plans that the simulator replays, outside the test split."""
-    test_replay_share: float = 1.0
+    test_replay_share: Share = 1.0
     """The same for the test split."""
-    goals_seed: int | None = None
+    goals_seed: Natural | None = None
     """Seed of the goals alone, for another goal set over the same scenes; None: `seed`."""
     policy: str = "found"
     """How relevance is read from the plans."""
 
-    def __post_init__(self) -> None:
-        def require(name: str, good: bool, expected: str) -> None:
-            if not good:
-                found = getattr(self, name)
-                raise ValueError(f"DatasetConfig.{name} = {found!r}: expected {expected}")
-
-        require("seed", self.seed >= 0, "at least 0")
-        require("goals_seed", (self.goals_seed or 0) >= 0, "at least 0")
-        require("scenes_per_shard", self.scenes_per_shard >= 1, "at least 1")
-        require("goals_per_scene", self.goals_per_scene >= 1, "at least 1")
-        require("replay_share", 0 <= self.replay_share <= 1, "0 to 1")
-        require("test_replay_share", 0 <= self.test_replay_share <= 1, "0 to 1")
-        require("policy", self.policy in POLICIES, f"one of {', '.join(POLICIES)}")
+    @field_validator("policy")
+    @classmethod
+    def _known(cls, policy: str) -> str:
+        if policy not in POLICIES:
+            raise ValueError(f"one of {', '.join(POLICIES)}")
+        return policy
 
     def counts(self, split: str) -> Counts:
         """Scenes asked for in a split."""
         return {"train": self.train, "validation": self.validation, "test": self.test}[split]
 
     @property
+    def drawn_as(self) -> DatasetConfig:
+        """The settings that change a scene, all others at their defaults."""
+        return DatasetConfig(seed=self.seed, scene=settings_of_family(self.scene, FAMILIES[0]))
+
+    @property
+    def planned_as(self) -> DatasetConfig:
+        """The settings that change a plan row, all others at their defaults."""
+        return DatasetConfig(
+            goals_seed=self.drawn_by,
+            goals_per_scene=self.goals_per_scene,
+            goals=self.goals,
+            planner=self.planner,
+            replay_share=self.replay_share,
+            test_replay_share=self.test_replay_share,
+        )
+
+    @property
     def scenes_hash(self) -> str:
         """Changes with whatever changes a scene, not with how many there are."""
-        return content_hash([self.seed, settings_of_family(self.scene, FAMILIES[0])])
+        return identity_hash(self.drawn_as, sampler=SAMPLER_VERSION, renderer=RENDERER_VERSION)
 
     @property
     def plans_hash(self) -> str:
-        """Changes with whatever changes a plan row."""
-        shares = [self.replay_share, self.test_replay_share]
-        return content_hash([self.drawn_by, self.goals_per_scene, self.goals, self.planner, shares])
+        """Changes with whatever changes a plan row, but for the planner, which is named beside."""
+        return identity_hash(self.planned_as, sampler=SAMPLER_VERSION, labels=LABELS_VERSION)
 
     @property
     def content_hash(self) -> str:
-        """Changes with every setting."""
-        return content_hash(self)
+        """Changes with every setting and every version."""
+        return identity_hash(self, **versions(), planner=PLANNER_VERSION)
 
     @property
     def drawn_by(self) -> int:
@@ -202,6 +222,24 @@ class ShardReport:
     seconds: float = 0.0
 
 
+def versions() -> dict[str, str]:
+    """Versions of the stages of today, but for the planner's."""
+    return {"sampler": SAMPLER_VERSION, "renderer": RENDERER_VERSION, "labels": LABELS_VERSION}
+
+
+def settings_of_family(settings: SceneConfig, family: str) -> SceneConfig:
+    """Scene settings for a family."""
+    return replace(settings, family=family)
+
+
+def scenes_of(specs: Iterable[ShardSpec], split: str) -> Counts:
+    """How many scenes the shards of a split have."""
+    mine = [spec for spec in specs if spec.split == split]
+    return Counts.by_family(
+        {f: sum(spec.count for spec in mine if spec.family == f) for f in FAMILIES}
+    )
+
+
 def shard_specs(config: DatasetConfig, finished: list[ShardSpec] | None = None) -> list[ShardSpec]:
     """Every shard of a config; `finished` ones stay as they are, more are appended to them."""
     specs = list(finished or ())
@@ -225,113 +263,29 @@ def shard_specs(config: DatasetConfig, finished: list[ShardSpec] | None = None) 
     return sorted(specs, key=lambda s: (SPLITS.index(s.split), s.shard))
 
 
-def prepare(
-    root: str | Path, config: DatasetConfig, *, replan: bool = False, scenes_only: bool = False
-) -> list[ShardSpec]:
-    """Make or extend a dataset's dataset.json; returns every shard of it.
-
-    More scenes than before append shards and renumber none. Raises DatasetError when the
-    dataset there was drawn with other settings, or planned with others unless `replan`: then
-    `label_shard` makes its plans and labels anew (scenes and images stay, and so do the old
-    plans and labels, beside the new ones). With `scenes_only` the planner of today may be
-    another one than labelled the dataset.
-    """
-    root = locate(root)
-    if not (root / "dataset.json").exists():
-        specs = shard_specs(config)
-        Dataset.create(root, describe(config, specs))
-        return specs
-    there = Dataset.open(root)
-    refuse_merged(there)
-    sweep(root)
-    specs = shard_specs(config, shards_of(there))
-    for split in SPLITS:  # asking for fewer than there are keeps what there is
-        grown = {
-            name: sum(s.count for s in specs if (s.split, s.family) == (split, family))
-            for name, family in (("same_plane", "same-plane"), ("on", "on"))
-        }
-        config = replace(config, **{split: Counts(**grown)})
-    wanted = describe(config, specs)
-    if scenes_only:
-        wanted["planner_version"] = there.description.get("planner_version", PLANNER_VERSION)
-    ignore = _GROWING + (_PLANNING if replan else ())
-    # read and written again: a setting that is younger than the dataset has its default there
-    before = {**there.description, "config": _CONFIG.dump_python(load_config(there), mode="json")}
-    for key, found, expected in differences(before, wanted, ignore=ignore):
-        planning = key.startswith(_PLANNING)
-        hint = "plan it anew (replan)" if planning else "take another folder or the same settings"
-        raise DatasetError(
-            f"{root / 'dataset.json'}: {key}: the dataset was made with {found!r}, "
-            f"found {expected!r}; {hint}"
-        )
-    if wanted != {key: value for key, value in there.description.items() if key != "finished"}:
-        there.describe(wanted)  # and no longer finished
-    return specs
-
-
-_GROWING = (
-    "finished",
-    "config.train",
-    "config.validation",
-    "config.test",
-    "config.scenes_per_shard",
-    "counts",
-    "shards",
-)
-_PLANNING = (
-    "config.goals_per_scene",
-    "config.goals_seed",
-    "config.planner",
-    "config.policy",
-    "config.replay_share",
-    "config.test_replay_share",
-    "hashes.plans",
-    "planner_version",
-)
-
-
-def describe(config: DatasetConfig, specs: list[ShardSpec]) -> dict[str, Any]:
-    """What dataset.json holds: settings, their hashes, versions, counts and the shards."""
-    return {
-        "layout": LAYOUT,
-        "config": _CONFIG.dump_python(config, mode="json"),
-        "hashes": {"scenes": config.scenes_hash, "plans": config.plans_hash},
-        "planner_version": PLANNER_VERSION,
-        "tables": {table: table_schema(table).version for table in TABLES},
-        "counts": {
-            split: {
-                family: sum(s.count for s in specs if (s.split, s.family) == (split, family))
-                for family in FAMILIES
-            }
-            for split in SPLITS
-        },
-        "shards": _SPECS.dump_python(specs, mode="json"),
-    }
-
-
 def load_config(dataset: Dataset) -> DatasetConfig:
     """The config that a dataset was made with; raises DatasetError that names the field."""
-    return _from_description(dataset, "config", _CONFIG)
+    return read_config(dataset, "config", dataset.description)
+
+
+def read_config(dataset: Dataset, key: str, said: Mapping[str, Any]) -> DatasetConfig:
+    """A config that is kept in dataset.json, younger settings having their defaults."""
+    return _from_description(dataset, key, said, _CONFIG)
 
 
 def shards_of(dataset: Dataset) -> list[ShardSpec]:
     """Every shard that dataset.json lists, finished or not."""
-    return _from_description(dataset, "shards", _SPECS)
+    return _from_description(dataset, "shards", dataset.description, _SPECS)
 
 
-def append(root: str | Path, split: str, *, same_plane: int = 0, on: int = 0) -> list[ShardSpec]:
-    """Add that many scenes to a split, as further shards with the next indices; all the shards.
+def dump_config(config: DatasetConfig) -> dict[str, Any]:
+    """The JSON form of a config."""
+    return _CONFIG.dump_python(config, mode="json")
 
-    What is there is neither renumbered nor rewritten. Raises DatasetError for an unknown split.
-    """
-    if split not in SPLITS:
-        raise DatasetError(f"split {split!r}: expected one of {', '.join(SPLITS)}")
-    if same_plane < 0 or on < 0 or same_plane + on == 0:
-        raise DatasetError(f"append {same_plane} and {on} scenes: expected at least 1 in all")
-    config = load_config(Dataset.open(root))
-    now = config.counts(split)
-    more = Counts(same_plane=now.same_plane + same_plane, on=now.on + on)
-    return prepare(root, replace(config, **{split: more}), scenes_only=True)
+
+def dump_specs(specs: Sequence[ShardSpec]) -> list[dict[str, Any]]:
+    """The JSON form of shards."""
+    return _SPECS.dump_python(list(specs), mode="json")
 
 
 def refuse_merged(dataset: Dataset) -> None:
@@ -341,17 +295,16 @@ def refuse_merged(dataset: Dataset) -> None:
         raise DatasetError(f"{dataset.path}: is merged by reference; make shards in {names}")
 
 
-def settings_of_family(settings: SceneConfig, family: str) -> SceneConfig:
-    """Scene settings for a family."""
-    return replace(settings, family=family)
-
-
-def _from_description(dataset: Dataset, key: str, adapter: TypeAdapter[Any]) -> Any:
+def _from_description(
+    dataset: Dataset, key: str, said: Mapping[str, Any], adapter: TypeAdapter[Any]
+) -> Any:
     file = dataset.path / "dataset.json"
-    if key not in dataset.description:
+    if key not in said:
         raise DatasetError(f"{file}: {key}: expected there, found no such key")
     try:
-        return adapter.validate_python(dataset.description[key])
+        return adapter.validate_python(said[key])
+    except ConfigError as error:
+        raise DatasetError(f"{file}: {key}: {error}") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         field_name = ".".join(str(part) for part in (key, *first["loc"]))

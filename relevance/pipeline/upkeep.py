@@ -2,7 +2,7 @@
 
 `finish` notes in dataset.json which stages are complete; from then on a file that is not there
 was deleted. `integrity` names every such file, and everything beside the current tables that is
-not what it should be; `repair` deletes what `check` has named and says what has to be made.
+not what it should be; `broken` says which of the named files can be made anew exactly.
 """
 
 from __future__ import annotations
@@ -11,19 +11,33 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from relevance.pipeline.settings import ShardSpec, shards_of
-from relevance.pipeline.shards import generated
+from relevance.pipeline.labelling import labelled_as
+from relevance.pipeline.preparing import change_over, clear, labelling_of, resumed
+from relevance.pipeline.scenes import generated
+from relevance.pipeline.settings import ShardSpec, load_config, shards_of
 from relevance.scene import PREDICATES
-from relevance.store import Dataset, DatasetError
+from relevance.store import TABLES, Dataset, DatasetError, Labelling
 
-REMADE = ("scenes", "images", "plans", "timings", "labels", "durations", "beside", "compacted")
-"""Folders whose files `generate` and `label` make again when they are gone."""
+REFUSED_SHARE = 0.01
+"""Share of the replayed plans that the replay may refuse."""
+REFUSED_LEAST = 2
+"""Refused replays that count as chance whatever their share."""
+
+Key = tuple[str, int, str | None, str | None]
+"""Split, shard, predicate, policy."""
 
 
 def finish(root: str | Path) -> None:
-    """Note in dataset.json which stages have all their files: scenes, and predicates labelled."""
-    dataset = Dataset.open(root)
+    """Note in dataset.json which stages have all their files: scenes, and predicates labelled.
+
+    Plans that were made anew take the place of the old ones once none of them is missing.
+    """
+    dataset = resumed(root)
     specs = shards_of(dataset)
+    found = dataset.description.get("next")
+    if found and _complete(dataset, labelling_of(found), specs):
+        change_over(dataset)
+    clear(dataset)
     finished = [
         *(["scenes"] if all(generated(dataset, spec) for spec in specs) else []),
         *(
@@ -35,6 +49,43 @@ def finish(root: str | Path) -> None:
     ]
     if dataset.description.get("finished") != finished:
         dataset.describe({**dataset.description, "finished": finished})
+
+
+def _complete(dataset: Dataset, way: Labelling, specs: list[ShardSpec]) -> bool:
+    """Whether every shard that is labelled now is labelled in the new way too."""
+    return all(
+        labelled_as(dataset, way, spec, predicate)
+        for spec in specs
+        for predicate in spec.predicates
+        if dataset.has("labels", split=spec.split, shard=spec.shard, predicate=predicate.name)
+        or dataset.has("plans", split=spec.split, shard=spec.shard, predicate=predicate.name)
+    )
+
+
+def refused(dataset: Dataset) -> str | None:
+    """What is wrong when the replay refuses more plans than chance allows; None when it does not.
+
+    Then those plans that were not replayed cannot be believed either.
+    """
+    files = [file for table in TABLES for file in dataset.files(table)] + dataset.files_beside()
+    unreadable = {file for file in files if _cut(dataset, file)}
+    with dataset.connect(without=unreadable) as connection:
+        query = "select count(replay_ok), count(*) filter (not replay_ok) from plans"
+        [(replayed, bad)] = connection.execute(query).fetchall()
+    if bad <= max(REFUSED_LEAST, REFUSED_SHARE * replayed):
+        return None
+    return (
+        f"the replay refuses {bad} of {replayed} plans, expected at most {REFUSED_SHARE:.0%}; "
+        "planner and replay disagree about these scenes, so do not trust the other plans"
+    )
+
+
+def _cut(dataset: Dataset, file: Path) -> bool:
+    try:
+        dataset.metadata(file)
+    except DatasetError:
+        return True  # named by whoever reads it
+    return False
 
 
 def _missing(dataset: Dataset, spec: ShardSpec, predicate: str) -> list[Path]:
@@ -102,30 +153,42 @@ def _differences(
             return
 
 
-def repair(root: str | Path, named: Iterable[str]) -> list[str]:
-    """Delete those of the named files that `generate` and `label` make again; the others' names.
+def broken(dataset: Dataset, named: Iterable[str]) -> tuple[dict[Key, set[str]], dict[str, str]]:
+    """Which of the named files can be made anew exactly, and why the others cannot.
 
-    After it `generate` and `label` complete the dataset. A scenes file goes with its tar, plans
-    with their timings, so that what belongs together is made together.
+    The first by what makes them (split, shard, predicate, policy), None where it is neither
+    labels nor of another policy than the dataset's own; the second by name.
     """
-    dataset = Dataset.open(root)
-    left = []
+    anew: dict[Key, set[str]] = {}
+    left: dict[str, str] = {}
+    config, specs = load_config(dataset), shards_of(dataset)
+    listed = {(spec.split, spec.shard): spec for spec in specs}
+    drawn = dataset.description.get("hashes", {}).get("scenes") == config.scenes_hash
+    planned = dataset.labelling == config.labelling
     for name in dict.fromkeys(named):
-        file = dataset.path / name
-        top = Path(name).parts[0]
-        if top not in REMADE:
-            if name != "dataset.json" or not file.is_file():
-                left.append(name)
+        parts = Path(name).parts
+        top, keys = parts[0], dataset.file_keys(dataset.path / name)
+        spec = listed.get((keys.get("split", ""), keys.get("shard", -1)))
+        table = parts[3] if top == "beside" and len(parts) > 3 else top
+        if table == "compacted":
+            continue  # gathered again from the labels
+        if table not in ("scenes", "images", "plans", "timings", "labels") or spec is None:
+            left[name] = "nothing makes it anew"
             continue
-        together = [file]
-        keys = dataset.file_keys(file)
-        if top in ("scenes", "images"):
-            where = {"split": keys["split"], "shard": keys["shard"]}
-            together += [dataset.shard_path("scenes", **where), dataset.images_path(**where)]
-        elif top in ("plans", "timings"):
-            where = {key: keys[key] for key in ("split", "shard", "predicate")}
-            together += [dataset.shard_path(table, **where) for table in ("plans", "timings")]
-        for item in together:
-            if item.is_file():
-                item.unlink()
-    return left
+        if table in ("scenes", "images"):
+            if drawn:
+                anew.setdefault((spec.split, spec.shard, None, None), set()).add("scenes")
+            else:
+                left[name] = "it was drawn or rendered by another version"
+            continue
+        way = dataset.labelling
+        if top == "beside" and way is not None:
+            way = Labelling(planner=keys["planner"], config=keys["config"], policy=way.policy)
+        if not planned or way != dataset.labelling:
+            left[name] = "it was planned by another version or with other settings"
+            continue
+        policy = keys.get("policy")
+        policy = None if policy == config.policy else policy
+        key = (spec.split, spec.shard, keys["predicate"], policy)
+        anew.setdefault(key, set()).add("labels" if table == "labels" else "plans")
+    return anew, left

@@ -7,24 +7,22 @@ before anything is written.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from relevance.configs import override
+from relevance.errors import RelevanceError
 from relevance.labels import POLICIES
-from relevance.pipeline.settings import (
-    DatasetConfig,
-    ShardReport,
-    ShardSpec,
-    load_config,
-    prepare,
-)
-from relevance.pipeline.shards import Progress, generate_shard, generated, label_shard, labelled
-from relevance.pipeline.upkeep import finish
+from relevance.pipeline.labelling import label_shard, labelled
+from relevance.pipeline.measuring import Progress
+from relevance.pipeline.preparing import pending, prepare, refuse_other_scenes, resumed
+from relevance.pipeline.scenes import generate_shard, generated, try_out
+from relevance.pipeline.settings import DatasetConfig, ShardReport, ShardSpec, load_config
+from relevance.pipeline.upkeep import broken, finish, refused
 from relevance.scene import PREDICATES
-from relevance.store import Dataset, DatasetError, absolute
+from relevance.store import Dataset, DatasetError, absolute, compact
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,6 +38,8 @@ class Job:
     """None for scenes and images."""
     policy: str | None = None
     """Another label policy than the dataset's own."""
+    anew: frozenset[str] = frozenset()
+    """What is made again although it is there: `scenes`, or `plans` or `labels`."""
 
     @property
     def name(self) -> str:
@@ -55,9 +55,15 @@ class Job:
     def run(self, progress: Progress | None = None) -> ShardReport:
         """Make it; `progress` hears (scenes done, scenes in all)."""
         if self.predicate is None:
-            return generate_shard(self.root, self.config, self.spec, progress)
+            return generate_shard(self.root, self.config, self.spec, progress, anew=bool(self.anew))
         return label_shard(
-            self.root, self.config, self.spec, self.predicate, progress, policy=self.policy
+            self.root,
+            self.config,
+            self.spec,
+            self.predicate,
+            progress,
+            policy=self.policy,
+            anew=self.anew,
         )
 
 
@@ -67,6 +73,7 @@ class Work:
 
     root: Path
     config: DatasetConfig
+    stage: Literal["generate", "label"]
     jobs: tuple[Job, ...]
     """What is missing; any order, any process."""
     done: int = 0
@@ -77,9 +84,12 @@ class Work:
     def finish(self) -> None:
         """Note which stages are complete; raises RelevanceError for what must not pass unseen.
 
-        Called once the jobs have run; a second call changes nothing.
+        Called once the jobs have run; a second call changes nothing. What must not pass unseen:
+        more refused replays than chance allows.
         """
         finish(self.root)
+        if self.stage == "label" and (problem := refused(Dataset.open(self.root))):
+            raise RelevanceError(f"{self.root}: {problem}")
 
 
 def scenes_work(root: str | Path, config: DatasetConfig) -> Work:
@@ -89,14 +99,34 @@ def scenes_work(root: str | Path, config: DatasetConfig) -> Work:
     that is there.
     """
     root = absolute(root)
+    if not (root / "dataset.json").is_file():
+        try_out(config)
     specs = prepare(root, config, scenes_only=True)
+    return _scenes(root, config, specs)
+
+
+def _scenes(
+    root: Path,
+    config: DatasetConfig,
+    specs: Sequence[ShardSpec],
+    anew: Collection[tuple[str, int]] = (),
+) -> Work:
     dataset = Dataset.open(root)
     jobs = [
-        Job(root=root, config=config, stage="generate", spec=spec)
+        Job(
+            root=root,
+            config=config,
+            stage="generate",
+            spec=spec,
+            anew=frozenset({"scenes"} if (spec.split, spec.shard) in anew else ()),
+        )
         for spec in specs
-        if not generated(dataset, spec)
+        if (spec.split, spec.shard) in anew or not generated(dataset, spec)
     ]
-    return Work(root=root, config=config, jobs=tuple(jobs), done=len(specs) - len(jobs))
+    if jobs:
+        refuse_other_scenes(dataset, config)
+    done = len(specs) - len(jobs)
+    return Work(root=root, config=config, stage="generate", jobs=tuple(jobs), done=done)
 
 
 def labels_work(
@@ -113,37 +143,65 @@ def labels_work(
 
     `predicates` are all of them when None or empty; `policy` is the dataset's own when None.
     Other settings (`goals_per_scene`, `goals_seed`, or `overrides` by dotted name) ask to plan
-    anew, as `replan` does. Raises RelevanceError for an unknown predicate, policy or setting, and
-    for a dataset without any scene.
+    anew, as `replan` does; what was cut short goes on without asking again. Raises RelevanceError
+    for an unknown predicate, policy or setting, and for a dataset without any scene.
     """
     chosen = [PREDICATES[name] for name in predicates or PREDICATES]
-    if policy is not None and policy not in POLICIES:
-        raise DatasetError(f"policy {policy!r}: expected one of {', '.join(POLICIES)}")
+    if policy is not None:
+        POLICIES[policy]  # refuses an unknown one
     root = absolute(root)
     goals = {"goals_per_scene": goals_per_scene, "goals_seed": goals_seed}
     changes = {**(overrides or {}), **{k: v for k, v in goals.items() if v is not None}}
-    config = override(load_config(Dataset.open(root)), changes)
+    dataset = resumed(root)
+    under_way = None if replan or changes or policy else pending(dataset)
+    config = override(under_way or load_config(dataset), changes)
     specs = prepare(root, config, replan=replan or bool(changes))
     return _labels(root, config, specs, [predicate.name for predicate in chosen], policy)
 
 
-def missing(root: str | Path) -> Iterator[Work]:
+def missing(root: str | Path, named: Iterable[str] = ()) -> Iterator[Work]:
     """What `repair` makes: scenes first, then labels of each policy that the dataset has some of.
 
-    Do each before asking for the next: labels are only missing once their scenes are there.
+    Besides what is not there, those of the `named` files that can be made anew exactly, each
+    under a temporary name before it takes the place of the broken one (see `beyond_repair`). Do
+    each before asking for the next: labels are only missing once their scenes are there.
     """
     root = absolute(root)
-    dataset = Dataset.open(root)
+    dataset = resumed(root)
     config = load_config(dataset)
+    named = list(named)
+    anew, _ = broken(dataset, named)
+    specs = prepare(root, config, scenes_only=True)
+    shards = {(split, shard) for split, shard, predicate, _ in anew if predicate is None}
+    yield _scenes(root, config, specs, shards)
+    if dataset.labelling != config.labelling:
+        return  # planned by another version: what is missing has to be planned anew as a whole
     finished = dataset.description.get("finished", ())
     predicates = [
-        name for name in PREDICATES if name in finished or dataset.files("labels", predicate=name)
+        name
+        for name in PREDICATES
+        if name in finished
+        or dataset.files("labels", predicate=name)
+        or any(name == predicate for _, _, predicate, _ in anew)
     ]
-    policies = sorted({of.policy for of in dataset.labellings()} - {config.policy})
-    yield scenes_work(root, config)
-    specs = prepare(root, config)
-    for policy in (None, *policies):
-        yield _labels(root, config, specs, predicates, policy)
+    policies = {
+        of.policy for of in dataset.labellings() if of.planned_by == config.labelling.planned_by
+    }
+    for policy in (None, *sorted(policies - {config.policy})):
+        mine = {
+            (split, shard, predicate): tables
+            for (split, shard, predicate, of), tables in anew.items()
+            if predicate is not None and of == policy
+        }
+        if predicates:
+            yield _labels(root, config, specs, predicates, policy, mine)
+    if any(Path(name).parts[0] == "compacted" for name in named):
+        compact(Dataset.open(root))
+
+
+def beyond_repair(root: str | Path, named: Iterable[str]) -> dict[str, str]:
+    """Those of the named files that `missing` does not make anew, and why."""
+    return broken(Dataset.open(root), named)[1]
 
 
 def _labels(
@@ -152,6 +210,7 @@ def _labels(
     specs: Sequence[ShardSpec],
     predicates: Sequence[str],
     policy: str | None,
+    anew: Mapping[tuple[str, int, str], set[str]] | None = None,
 ) -> Work:
     dataset = Dataset.open(root)
     asked = [spec for spec in specs if any(p.name in predicates for p in spec.predicates)]
@@ -159,14 +218,24 @@ def _labels(
     if asked and not there:
         raise DatasetError(f"{root}: no scenes of these predicates, expected `generate` first")
     pairs = [(s, p.name) for s in there for p in s.predicates if p.name in predicates]
+    wanted = [(s, name, (anew or {}).get((s.split, s.shard, name), set())) for s, name in pairs]
     jobs = [
-        Job(root=root, config=config, stage="label", spec=spec, predicate=name, policy=policy)
-        for spec, name in pairs
-        if not labelled(dataset, config, spec, name, policy)
+        Job(
+            root=root,
+            config=config,
+            stage="label",
+            spec=spec,
+            predicate=name,
+            policy=policy,
+            anew=frozenset(tables),
+        )
+        for spec, name, tables in wanted
+        if tables or not labelled(dataset, config, spec, name, policy)
     ]
     return Work(
         root=root,
         config=config,
+        stage="label",
         jobs=tuple(jobs),
         done=len(pairs) - len(jobs),
         waiting=len(asked) - len(there),

@@ -83,6 +83,11 @@ class Files:
             raise DatasetError(f"{file}: expected a JSON object, found {error}") from None
         if not isinstance(description, dict):
             raise DatasetError(f"{file}: expected a JSON object, found {type(description)}")
+        if description.get("changing"):
+            raise DatasetError(
+                f"{file}: new plans were being put in the place of old ones when that was cut "
+                "short; `relevance label` does it to its end"
+            )
         return cls(path, description)
 
     @classmethod
