@@ -91,11 +91,12 @@ def evaluate(
     """
     from relevance.evaluation import EvaluationConfig
     from relevance.store import Dataset, sql
+    from relevance.training import find_checkpoint
 
     root = absolute(dataset)
     there = Dataset.open(root)
     config = configured(EvaluationConfig, preset, overrides)
-    path = absolute(checkpoint) if checkpoint else newest_checkpoint(root)
+    path = find_checkpoint(root, absolute(checkpoint) if checkpoint else None)
     shards = there.shards(config.split)
     if not shards:
         raise ParameterError(f"{root}: no {config.split} scenes, expected `generate` first")
@@ -126,17 +127,6 @@ def evaluate(
     )
     get_run_logger().info("evaluate: report %s", report)
     return str(report)
-
-
-def newest_checkpoint(root: Path) -> Path:
-    """The checkpoint that was made last; raises ParameterError when there is none."""
-    from relevance.store import Dataset
-
-    rows = Dataset.open(root).read_rows("checkpoints")
-    if not rows:
-        raise ParameterError(f"{root}: no checkpoints there, expected `train` first")
-    last = max(rows, key=lambda row: (row["created"], row["checkpoint_id"]))
-    return root / last["path"]
 
 
 def markdown(columns: list[str], rows: list[tuple[Any, ...]]) -> str:

@@ -37,7 +37,7 @@ from relevance.evaluation.comparisons import (
     settings,
     summarise,
 )
-from relevance.models import ModelConfig, RelevanceModel
+from relevance.models import BODIES, RelevanceModel
 from relevance.planner import plan
 from relevance.scene import Box, Goal, Scene
 from relevance.simulation import Renderer
@@ -183,7 +183,7 @@ def test_impossible_settings_are_refused_by_name(field, value, named) -> None:
 
 def small_model() -> RelevanceModel:
     torch.manual_seed(1)
-    return RelevanceModel(ModelConfig(width=32, heads=2, layers=1, channels=8)).eval()
+    return RelevanceModel(BODIES["glimpse"].config.smoke()).eval()
 
 
 def test_scores_are_the_models_own_and_cached_equals_uncached() -> None:

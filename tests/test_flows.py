@@ -239,11 +239,11 @@ def test_a_second_run_makes_nothing_and_tells_nobody(
 
 
 def test_flows_refuse_what_is_not_there(prefect_server: None, tmp_path: Path) -> None:
-    from flows.evaluate import newest_checkpoint
     from flows.generate import generate
     from flows.label import label
     from flows.train import train
     from relevance.pipeline import DatasetConfig, prepare
+    from relevance.training import newest_checkpoint
 
     for flow in (label, train):
         with pytest.raises(ValueError, match=r"no dataset\.json there"):
@@ -252,7 +252,7 @@ def test_flows_refuse_what_is_not_there(prefect_server: None, tmp_path: Path) ->
         generate(dataset=str(tmp_path / "a"), preset="smoke", overrides={"train.sum_plane": 1})
     assert list(tmp_path.iterdir()) == []
     prepare(tmp_path, DatasetConfig.smoke())
-    with pytest.raises(ParameterError, match="no checkpoints there, expected `train` first"):
+    with pytest.raises(ValueError, match="no checkpoints there, expected `train` first"):
         newest_checkpoint(tmp_path)
     with pytest.raises(ParameterError, match="no scenes of these predicates"):
         label(dataset=str(tmp_path))

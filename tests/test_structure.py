@@ -23,6 +23,7 @@ ORDER = (
     "planner",
     "labels",
     "models",
+    "metrics",
     "training",
     "pipeline",
     "evaluation",

@@ -112,10 +112,12 @@ def _label(_: Preset) -> Callable[..., int]:
     return label
 
 
-def _train(preset: Preset) -> Callable[..., int]:
+def _train(preset: Preset, body: str | None = None) -> Callable[..., int]:
     from relevance.training import TrainConfig
 
     start: TrainConfig = getattr(TrainConfig, preset)()
+    if body is not None:
+        start = start.with_body(body)
 
     # --preset is a setting of TrainConfig itself.
     def train(
@@ -154,12 +156,13 @@ def _evaluate(preset: Preset) -> Callable[..., int]:
 
         Args:
             dataset: Folder of a labelled dataset.
-            checkpoint: The model; the dataset's newest when not given.
+            checkpoint: The model, a file or an id; the dataset's newest when not given.
             preset: Where the other settings start from.
         """
         from relevance import evaluation
+        from relevance.training import find_checkpoint
 
-        path = checkpoint or _newest(dataset)
+        path = find_checkpoint(dataset, checkpoint)
         with bar("shards scored") as progress:
             scored = evaluation.predict(dataset, path, split=config.split, progress=progress)
         with bar("tasks") as progress:
@@ -409,15 +412,6 @@ def _dashboard(_: Preset) -> Callable[..., int]:
     return dashboard
 
 
-def _newest(dataset: Path) -> Path:
-    from relevance.store import Dataset
-
-    rows = Dataset.open(dataset).read_rows("checkpoints")
-    if not rows:
-        raise UsageError(f"{dataset}: no checkpoints there, expected `relevance train` first")
-    return dataset / max(rows, key=lambda row: (row["created"], row["checkpoint_id"]))["path"]
-
-
 def _plan_line(scene_id: str, result: Any, verdict: Any) -> dict[str, Any]:
     counts = {name: getattr(result.counts, name) for name in ("nodes", "pose", "keyframe", "path")}
     return {
@@ -451,10 +445,12 @@ def _plan_text(line: Mapping[str, Any]) -> str:
 class Command:
     """A subcommand: what makes its function, what it does in a few words, examples."""
 
-    make: Callable[[Preset], Callable[..., int]]
+    make: Callable[..., Callable[..., int]]
     about: str
     examples: tuple[str, ...]
     preset: Preset = "demo"
+    decides: tuple[str, ...] = ()
+    """Flags whose values `make` takes after the preset: other flags depend on them."""
 
 
 COMMANDS = {
@@ -480,8 +476,9 @@ COMMANDS = {
         about="a relevance model",
         examples=(
             "relevance train data/tables --preset laptop",
-            "relevance train data/tables --steps 3000 --model.body vit",
+            "relevance train data/tables --steps 3000 --model.body vit --model.width 64",
         ),
+        decides=("--model.body",),
     ),
     "evaluate": Command(
         make=_evaluate,

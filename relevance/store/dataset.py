@@ -455,12 +455,18 @@ class Dataset:
         """
         return queries.connect(self, policy=policy, origin=origin, without=without, memory=memory)
 
-    def content_hash(self) -> str:
-        """16 hex digits that change with any label or image (hashes kept in the files)."""
+    def content_hash(self, *, policy: str | None = None, split: str | None = None) -> str:
+        """16 hex digits that change with any label or image (hashes kept in the files).
+
+        Labels are those of `policy`, the dataset's own when None; of one split when it is given.
+        """
+        where = {} if split is None else {"split": split}
+        labels = queries._files_of(self, "labels", policy)
         hashes = {}
-        for table, key in (("labels", "sha256"), ("scenes", "images_sha256")):
-            for file in self.files(table):
-                hashes[self.name_of(file)] = self.metadata(file).get(key, "")
+        for files, key in ((labels, "sha256"), (self.files("scenes"), "images_sha256")):
+            for file in files:
+                if _agrees(self.file_keys(file), where):
+                    hashes[self.name_of(file)] = self.metadata(file).get(key, "")
         return content_hash(hashes)
 
 
