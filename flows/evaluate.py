@@ -60,12 +60,12 @@ def evaluate(
     """
     from relevance.evaluation import EvaluationConfig, load_scorer, speed_table
     from relevance.store import Dataset
-    from relevance.training.checkpoints import newest_checkpoint
+    from relevance.training import find_checkpoint
 
     root = absolute(dataset)
     there = Dataset.open(root)
     config = configured(EvaluationConfig, preset, overrides)
-    path = absolute(checkpoint) if checkpoint else newest_checkpoint(root)
+    path = find_checkpoint(root, absolute(checkpoint) if checkpoint else None)
     shards = there.shards(config.split)
     if not shards:
         raise ParameterError(f"{root}: no {config.split} scenes, expected `generate` first")

@@ -56,7 +56,10 @@ def configured(kind: type[C], preset: str, overrides: Mapping[str, Any] | None =
     make = getattr(kind, preset, None)
     if not callable(make) or preset.startswith("_"):
         raise ParameterError(f"preset {preset!r}: {kind.__name__} has no preset of that name")
-    return override(make(), overrides or {})
+    start: Any = make()
+    if body := (overrides or {}).get("model.body"):
+        start = start.with_body(body)  # which settings a model has depends on its body
+    return override(start, overrides or {})
 
 
 def absolute(path: str | Path) -> Path:

@@ -35,18 +35,14 @@ def retrain(
     """
     from relevance.evaluation import EvaluationConfig
     from relevance.store import Dataset, sql
-    from relevance.training import TrainConfig
+    from relevance.training import TrainConfig, checkpoint_id
 
     root = absolute(dataset)
     there = Dataset.open(root)
     config = configured(TrainConfig, preset, overrides)
     configured(EvaluationConfig, preset, evaluation)  # refused now, not after an hour of training
-    data = there.content_hash()
-    same = [
-        row["checkpoint_id"]
-        for row in there.read_rows("checkpoints")
-        if (row["dataset_hash"], row["config_hash"]) == (data, config.content_hash)
-    ]
+    name = checkpoint_id(there, config)
+    same = [name] if there.has("checkpoints", name=name) else []
     evaluated = {name for (name,) in sql(root, "select distinct checkpoint_id from evaluations")[1]}
     if evaluated.intersection(same) and not force:
         say("retrain: nothing new since %s", same[0])

@@ -32,7 +32,7 @@ from relevance.evaluation import (
     read_predictions,
     unjudged,
 )
-from relevance.models import ModelConfig, RelevanceModel
+from relevance.models import BODIES, RelevanceModel
 from relevance.planner import plan
 from relevance.scene import Box, Camera, Goal, Scene
 from relevance.simulation import Renderer
@@ -179,7 +179,7 @@ def test_impossible_settings_are_refused_by_name(field, value, named) -> None:
 
 def small_model() -> RelevanceModel:
     torch.manual_seed(1)
-    return RelevanceModel(ModelConfig(width=32, heads=2, layers=1, channels=8)).eval()
+    return RelevanceModel(BODIES["glimpse"].config.smoke()).eval()
 
 
 def test_scores_are_the_models_own_and_cached_equals_uncached() -> None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -10,29 +14,35 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relevance import models
+from relevance.configs import ConfigError, config
 from relevance.models import (
     ANGLES,
+    BODIES,
+    DECIMETRE,
     GEOMETRY,
     STRIDE,
+    Body,
+    BodyKind,
     Encoding,
     ModelConfig,
+    ModelError,
     RelevanceModel,
+    glimpse,
     half_extents,
     mirrored,
-    relevance_loss,
-    vit_paper,
-    vit_small,
+    model_config,
 )
-from relevance.scene import PREDICATES, Box, Camera, Predicate, Robot, project
+from relevance.models.glimpse import GlimpseBody, GlimpseConfig
+from relevance.models.vit import VitConfig
+from relevance.scene import PREDICATES, Box, Camera, Predicate, Rectangle, Robot, project
 
 torch.set_num_threads(1)  # threads that wait for each other crawl on a busy machine
 
-SMALL = {
-    "glimpse": ModelConfig(body="glimpse", width=32, heads=2, layers=2, channels=8),
-    "vit": ModelConfig(body="vit", width=32, heads=2, layers=2, hidden=24),
+SMALL: dict[str, ModelConfig] = {
+    "glimpse": GlimpseConfig(width=32, heads=2, layers=2, channels=8),
+    "vit": VitConfig(width=32, heads=2, layers=2, hidden=24),
 }
-BODIES = pytest.mark.parametrize("body", list(SMALL))
+ALL = pytest.mark.parametrize("body", list(SMALL))
 
 
 def model(body: str) -> RelevanceModel:
@@ -75,19 +85,19 @@ def test_vit_shared_encoding_equals_one_encoding_a_query() -> None:
 
 @torch.inference_mode()
 def test_glimpse_shared_encoding_equals_one_encoding_a_goal() -> None:
-    glimpse = model("glimpse")
+    network = model("glimpse")
     image, views = pictures()
-    encoding = glimpse.encode(image, views)
+    encoding = network.encode(image, views)
     for predicate in PREDICATES.values():
-        shared = glimpse.decode(encoding, predicate, GOALS)
+        shared = network.decode(encoding, predicate, GOALS)
         for b in range(2):
             for g in range(3):
-                alone = glimpse.encode(image[b : b + 1], views[b : b + 1])
-                score = glimpse.decode(alone, predicate, GOALS[b : b + 1, g : g + 1])
+                alone = network.encode(image[b : b + 1], views[b : b + 1])
+                score = network.decode(alone, predicate, GOALS[b : b + 1, g : g + 1])
                 torch.testing.assert_close(score[0, 0], shared[b, g], atol=1e-5, rtol=0)
 
 
-@BODIES
+@ALL
 @torch.inference_mode()
 def test_padding_changes_nothing(body: str) -> None:
     network = model(body)
@@ -99,7 +109,7 @@ def test_padding_changes_nothing(body: str) -> None:
     torch.testing.assert_close(wide[..., :5], plain, atol=1e-5, rtol=0)
 
 
-@BODIES
+@ALL
 @torch.inference_mode()
 def test_order_of_objects_only_reorders_scores(body: str) -> None:
     network = model(body)
@@ -124,13 +134,12 @@ def test_vit_tokens_do_not_see_other_objects() -> None:
     assert (before - darker).abs().amax(-1).min() > 1e-4, "every token must see the image"
 
 
-@BODIES
+@ALL
 def test_every_predicate_has_a_head_of_its_own(body: str) -> None:
     network = model(body)
     encoding = network.encode(*pictures())
     network.decode(encoding, PREDICATES["behind"], GOALS).sum().backward()
-    heads = network.body.heads if body == "glimpse" else network.body.extractors
-    assert isinstance(heads, torch.nn.ModuleDict)
+    heads = network.body.heads
     moved = {
         name for name, head in heads.items() if any(w.grad is not None for w in head.parameters())
     }
@@ -138,7 +147,7 @@ def test_every_predicate_has_a_head_of_its_own(body: str) -> None:
     assert set(heads) == {predicate.name for predicate in PREDICATES.values()}
 
 
-@BODIES
+@ALL
 @torch.inference_mode()
 def test_subject_and_reference_have_different_roles(body: str) -> None:
     network = model(body)
@@ -146,46 +155,6 @@ def test_subject_and_reference_have_different_roles(body: str) -> None:
     there = network.decode(encoding, "on", GOALS)
     back = network.decode(encoding, "on", GOALS.flip(-1))
     assert (there - back).abs().max() > 1e-3
-
-
-@BODIES
-def test_arrays_of_one_scene_score_as_tensors_do(body: str) -> None:
-    network = model(body)
-    image, views = pictures(batch=1)
-    encoding = network.encode_scene(
-        image[0].permute(1, 2, 0).numpy(), views[0].permute(0, 2, 3, 1).numpy()
-    )
-    goals = [(PREDICATES["on"], 0, 1), (PREDICATES["behind"], 3, 2), (PREDICATES["on"], 4, 0)]
-    scores = network.score_goals(encoding, goals)
-    assert scores.shape == (3, 5)
-    for row, (predicate, subject, reference) in zip(scores, goals, strict=True):
-        with torch.inference_mode():
-            pair = torch.tensor([[[subject, reference]]])
-            expected = network.decode(network.encode(image, views), predicate, pair)[0, 0]
-        np.testing.assert_allclose(row, expected.numpy(), atol=1e-5)
-
-
-def test_loss_by_hand() -> None:
-    scores = torch.tensor([2.0, -1.0, 0.5, 9.0])
-    relevant = torch.tensor([True, True, False, True])
-    mask = torch.tensor([True, True, True, False])
-    p = [1 / (1 + math.exp(-s)) for s in (2.0, -1.0, 0.5)]
-    by_hand = -(0.86 * math.log(p[0]) + 0.86 * math.log(p[1]) + 0.14 * math.log(1 - p[2])) / 3
-    assert float(relevance_loss(scores, relevant, mask, 0.86)) == pytest.approx(by_hand, abs=1e-6)
-    # missing a relevant object costs more than keeping an irrelevant one
-    missed = relevance_loss(torch.tensor([-1.0]), torch.ones(1), torch.ones(1), 0.86)
-    kept = relevance_loss(torch.tensor([1.0]), torch.zeros(1), torch.ones(1), 0.86)
-    assert float(missed / kept) == pytest.approx(0.86 / 0.14, rel=1e-5)
-
-
-def test_loss_of_nothing_is_zero_and_of_extreme_scores_finite() -> None:
-    scores = torch.tensor([400.0, -400.0], requires_grad=True)
-    assert relevance_loss(scores, torch.zeros(2), torch.zeros(2), 0.7).item() == 0.0
-    loss = relevance_loss(scores, torch.tensor([0.0, 1.0]), torch.ones(2), 0.7)
-    loss.backward()
-    assert torch.isfinite(loss)
-    assert scores.grad is not None
-    assert torch.isfinite(scores.grad).all()
 
 
 @given(
@@ -205,24 +174,24 @@ def test_half_extents_are_those_of_the_corners(x: float, y: float, yaw: float) -
 @given(x=st.floats(-0.15, 0.25), y=st.floats(-0.3, 0.3))
 def test_sight_lines_invert_the_projection(x: float, y: float) -> None:
     camera = Camera()
-    pixel, _ = project(camera, np.array([x, y, models._GROUND]))
+    pixel, _ = project(camera, np.array([x, y, glimpse._GROUND]))
     uv = pixel / np.array([camera.width, camera.height]) * 2 - 1
-    found = models._on_the_ground(torch.tensor(uv, dtype=torch.float32), camera)
-    np.testing.assert_allclose(found.numpy() * models.DECIMETRE, [x, y], atol=1e-4)
+    found = glimpse._on_the_ground(torch.tensor(uv, dtype=torch.float32), camera)
+    np.testing.assert_allclose(found.numpy() * DECIMETRE, [x, y], atol=1e-4)
 
 
 def test_sight_lines_of_a_camera_that_looks_straight_down() -> None:
     camera = Camera(eye=(0.1, 0.0, 0.9), target=(0.1, 0.0, 0.0))
-    pixel, _ = project(camera, np.array([0.15, -0.1, models._GROUND]))
+    pixel, _ = project(camera, np.array([0.15, -0.1, glimpse._GROUND]))
     uv = pixel / np.array([camera.width, camera.height]) * 2 - 1
-    found = models._on_the_ground(torch.tensor(uv, dtype=torch.float32), camera)
-    np.testing.assert_allclose(found.numpy() * models.DECIMETRE, [0.15, -0.1], atol=1e-4)
+    found = glimpse._on_the_ground(torch.tensor(uv, dtype=torch.float32), camera)
+    np.testing.assert_allclose(found.numpy() * DECIMETRE, [0.15, -0.1], atol=1e-4)
 
 
 def test_soft_argmax_and_window_point_at_the_same_pixels() -> None:
     """A bright square in the image must be in the middle of the window around its centre."""
     body = model("glimpse").body
-    assert isinstance(body, models.GlimpseBody)
+    assert isinstance(body, GlimpseBody)
     image = torch.full((1, 3, 192, 320), 0.5)
     image[..., 80:92, 200:212] = 1.0  # centre at (206, 86)
     where = torch.zeros(1, 1, 48 * 80)
@@ -267,45 +236,134 @@ def test_goal_axes_turn_with_the_predicate(predicate: Predicate) -> None:
     c, s = math.cos(turn), math.sin(turn)
     turned = position @ torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     goals = torch.tensor([[[0, 1], [4, 2]]])
-    plain = models._goal_features(geometry(position, size, yaw), PREDICATES["behind"], goals)
-    other = models._goal_features(geometry(turned, size, yaw + turn), predicate, goals)
+    plain = glimpse._goal_features(geometry(position, size, yaw), PREDICATES["behind"], goals)
+    other = glimpse._goal_features(geometry(turned, size, yaw + turn), predicate, goals)
     torch.testing.assert_close(other, plain, atol=1e-5, rtol=0)
-    assert plain.shape == (1, 2, 5, models._GOAL_FEATURES)
+    assert plain.shape == (1, 2, 5, glimpse._GOAL_FEATURES)
 
 
 def test_glimpse_reads_its_geometry() -> None:
     """Scores depend on the estimated geometry, so its loss teaches the heads what they use."""
-    glimpse = model("glimpse")
-    encoding = glimpse.encode(*pictures())
+    network = model("glimpse")
+    encoding = network.encode(*pictures())
     assert encoding.geometry is not None
     assert encoding.geometry.shape == (2, 5, GEOMETRY)
     moved = Encoding(
         tokens=encoding.tokens, present=encoding.present, geometry=encoding.geometry + 1.0
     )
     with torch.no_grad():
-        difference = glimpse.decode(encoding, "on", GOALS) - glimpse.decode(moved, "on", GOALS)
+        difference = network.decode(encoding, "on", GOALS) - network.decode(moved, "on", GOALS)
     assert difference.abs().max() > 1e-3
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("kind", "change", "message"),
     [
-        ({"body": "resnet"}, "body is 'resnet', expected one of glimpse, vit"),
-        ({"width": 30}, "width is 30, expected a multiple of heads 4"),
-        ({"layers": 0}, "layers is 0, expected at least 1"),
-        ({"camera": Camera(width=300)}, "image is 300x192, expected multiples of 32"),
+        (VitConfig, {"width": 32}, "VitConfig: width is 32, expected a multiple of heads 6"),
+        (GlimpseConfig, {"layers": 0}, r"GlimpseConfig\.layers = 0: expected greater than"),
+        (GlimpseConfig, {"body": "vit"}, r"GlimpseConfig\.body = 'vit': expected 'glimpse'"),
+        (VitConfig, {"window": 30}, r"VitConfig\.window: unknown field"),
+        (VitConfig, {"camera": Camera(width=300)}, "image is 300x192, expected multiples of 32"),
     ],
 )
-def test_config_refuses(change: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        ModelConfig(**change)
+def test_config_refuses(kind: type[ModelConfig], change: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as error:
+        kind(**change)
+    assert "\n" not in str(error.value)
 
 
-def test_config_survives_plain_values() -> None:
-    for config in (ModelConfig(), vit_small(), vit_paper()):
-        assert ModelConfig.from_dict(config.to_dict()) == config
+def test_configs_come_back_from_plain_values() -> None:
+    for kind in BODIES.values():
+        for made in (kind.config(), kind.config.smoke(), kind.config.paper()):
+            assert model_config(json.loads(json.dumps(asdict(made)))) == made
+    with pytest.raises(ValueError, match="unknown body 'cnn', expected one of glimpse, vit"):
+        model_config({"body": "cnn"})
 
 
 def test_image_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match="image is 64x64, expected 320x192"):
+    with pytest.raises(ModelError, match="image is 64x64, expected 320x192"):
         model("vit").encode(torch.zeros(1, 3, 64, 64), torch.zeros(1, 1, 3, 32, 32))
+
+
+# --- heads ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Near(Predicate):
+    """Anywhere within a hand's breadth: no direction."""
+
+    def region(self, subject: Box, reference: Box, robot: Robot) -> Rectangle:
+        x, y = reference.position[:2]
+        return Rectangle(x=x, y=y, angle=0.0, half=(0.1, 0.1))
+
+
+@pytest.fixture
+def near() -> Iterator[Predicate]:
+    predicate = Near(name="near", family="same-plane", mirror="near")
+    yield PREDICATES.register("near", predicate)
+    PREDICATES.unregister("near")
+
+
+@ALL
+@torch.inference_mode()
+def test_one_more_head_leaves_the_others_as_they_are(body: str, near: Predicate) -> None:
+    known = tuple(name for name in PREDICATES if name != "near")
+    torch.manual_seed(3)
+    before = RelevanceModel(SMALL[body], known).eval()
+    torch.manual_seed(3)
+    after = RelevanceModel(SMALL[body], (*known, "near")).eval()
+    scenes = pictures()
+    for name in known:
+        scores = [m.decode(m.encode(*scenes), name, GOALS) for m in (before, after)]
+        assert torch.equal(*scores)
+    assert after.decode(after.encode(*scenes), near, GOALS).isfinite().all()
+    with pytest.raises(ModelError, match="has no head for near, was trained on on-the-left, on-th"):
+        before.decode(before.encode(*scenes), near, GOALS)
+    after.load_state_dict({**after.state_dict(), **before.state_dict()})  # nothing is renamed
+
+
+@torch.inference_mode()
+def test_a_body_is_registered_from_outside() -> None:
+    @config
+    class MeanConfig(ModelConfig):
+        body: Literal["mean"] = "mean"
+        width: int = 4
+
+    class MeanBody(Body):
+        def __init__(self, config: MeanConfig, predicates: Sequence[str]) -> None:
+            super().__init__()
+            self.heads = torch.nn.ModuleDict({n: torch.nn.Linear(3, 1) for n in predicates})
+
+        def encode(
+            self, image: torch.Tensor, views: torch.Tensor, present: torch.Tensor
+        ) -> Encoding:
+            return Encoding(tokens=views.mean((-1, -2)), present=present)
+
+        def decode(
+            self, encoding: Encoding, predicate: Predicate, goals: torch.Tensor
+        ) -> torch.Tensor:
+            score = self.heads[predicate.name](encoding.tokens)[..., 0]
+            return score[:, None].expand(-1, goals.shape[1], -1)
+
+    BODIES.register("mean", BodyKind(config=MeanConfig, make=MeanBody, version="1"))
+    try:
+        network = RelevanceModel(model_config({"body": "mean", "width": 5}))
+        assert network.decode(network.encode(*pictures()), "on", GOALS).shape == (2, 3, 5)
+    finally:
+        BODIES.unregister("mean")
+
+
+@pytest.mark.parametrize("angle", range(8))
+def test_any_direction_in_steps_of_the_regressed_ones(angle: int) -> None:
+    """A predicate may point anywhere; `behind`, turned along, shows the heads the same thing."""
+    turn = angle * math.pi / ANGLES
+    generator = torch.Generator().manual_seed(4)
+    position, size = (torch.rand(1, 5, 3, generator=generator) for _ in range(2))
+    yaw = torch.rand(1, 5, generator=generator) * 3
+    c, s = math.cos(turn), math.sin(turn)
+    turned = position @ torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    goals = torch.tensor([[[0, 1], [4, 2]]])
+    slanted = replace(PREDICATES["behind"], name="slanted", toward=(c, s))
+    plain = glimpse._goal_features(geometry(position, size, yaw), PREDICATES["behind"], goals)
+    other = glimpse._goal_features(geometry(turned, size, yaw + turn), slanted, goals)
+    torch.testing.assert_close(other, plain, atol=1e-5, rtol=0)

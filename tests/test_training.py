@@ -1,39 +1,32 @@
-"""Training: polling order, batches by (seed, step), checkpoints, a killed run, metrics."""
+"""Training: polling order, batches by (seed, step), losses, learning, metrics, config."""
 
 from __future__ import annotations
 
-import json
-import os
+import math
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
 import torch
+from ruled import ruled
 
 from relevance import training
-from relevance.models import ModelConfig, RelevanceModel, relevance_loss
-from relevance.pipeline import Counts, DatasetConfig, generate_shard, prepare
-from relevance.sampling import SceneConfig, sample_goals
+from relevance.metrics import accuracy
+from relevance.models import BODIES, RelevanceModel
+from relevance.models.glimpse import GlimpseConfig
+from relevance.models.vit import VitConfig
 from relevance.scene import PREDICATES, Camera
-from relevance.store import Dataset, DatasetError
+from relevance.store import Dataset
 from relevance.training import (
-    CheckpointError,
     TrainConfig,
-    accuracy,
     batch_loss,
     draw_batch,
-    load_checkpoint,
     measure,
     polling,
-    train,
+    relevance_loss,
 )
 from relevance.training.examples import (
     Examples,
@@ -46,15 +39,8 @@ from relevance.training.examples import (
 torch.set_num_threads(1)  # threads that wait for each other crawl on a busy machine
 
 SAME_PLANE = tuple(p for p in PREDICATES.values() if p is not PREDICATES["on"])
-DATA = DatasetConfig(
-    seed=5,
-    train=Counts(same_plane=6, on=4),
-    validation=Counts(same_plane=2, on=2),
-    scenes_per_shard=4,
-    scene=SceneConfig(max_objects=5),
-)
 CONFIG = TrainConfig(
-    model=ModelConfig(width=32, heads=2, layers=1, channels=8),
+    model=GlimpseConfig(width=32, heads=2, layers=1, channels=8),
     steps=6,
     scenes_per_batch=4,
     save_every=2,
@@ -62,54 +48,10 @@ CONFIG = TrainConfig(
 )
 
 
-def label(dataset: Dataset) -> None:
-    """Labels by a rule that needs no planner: the subject, and what stands within 20 cm of it."""
-    for predicate in PREDICATES.values():
-        for split in ("train", "validation"):
-            for shard in (
-                spec["shard"]
-                for spec in dataset.description["shards"]
-                if (spec["split"], spec["family"]) == (split, predicate.family)
-            ):
-                rows = []
-                for sample in dataset.samples(split, [shard]):
-                    scene = sample.scene
-                    for goal in sample_goals(scene, predicate, 2, seed=1):
-                        middle = np.array(scene[goal.subject].position)
-                        for box in scene.objects:
-                            near = np.linalg.norm(np.array(box.position) - middle) < 0.2
-                            names = {"subject": goal.subject, "reference": goal.reference}
-                            rows.append(
-                                {
-                                    "plan_id": f"{scene.id}-{goal}",
-                                    "scene_id": scene.id,
-                                    "split": split,
-                                    "shard": shard,
-                                    "predicate": predicate.name,
-                                    **names,
-                                    "query": box.name,
-                                    "relevant": bool(near and box.name != goal.reference),
-                                    "is_goal_object": box.name in names.values(),
-                                    "ambiguous": goal.subject == scene.names[0],
-                                    "policy": "found",
-                                    "visible_fraction": 1.0,
-                                    "planner_version": "rule",
-                                    "config_hash": "rule",
-                                }
-                            )
-                dataset.write_rows(
-                    "labels", rows, split=split, shard=shard, predicate=predicate.name
-                )
-
-
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made() -> Path:
     """Real scenes and images in real shards."""
-    root = tmp_path_factory.mktemp("dataset")
-    for spec in prepare(root, DATA):
-        generate_shard(root, DATA, spec)
-    label(Dataset.open(root))
-    return root
+    return ruled()
 
 
 @pytest.fixture
@@ -260,12 +202,18 @@ def test_the_mirror_shows_the_mirrored_scene(made: Path, examples: Examples) -> 
     assert torch.equal(in_the_mirror(flipped).geometry, batch.geometry)
 
 
+SMALL = {
+    "glimpse": GlimpseConfig(width=64, heads=2, layers=1, channels=16),
+    "vit": VitConfig(width=64, heads=2, layers=1, hidden=64),
+}
+
+
 # --- the loss and learning ----------------------------------------------------------------
 
 
 def test_loss_weighs_each_predicate_with_its_eta(examples: Examples) -> None:
     torch.manual_seed(0)
-    model = RelevanceModel(replace(CONFIG.model, body="vit"))
+    model = RelevanceModel(VitConfig.smoke())
     config = replace(CONFIG, mirror=False, eta_same_plane=0.8, eta_on=0.6)
     for step, eta in ((0, 0.8), (1, 0.6)):
         batch = draw_batch(examples, config, step)
@@ -293,11 +241,9 @@ def test_each_scene_is_encoded_once_for_all_goals_and_predicates(
     assert len(batch.turns) == 4
 
 
-@pytest.mark.parametrize("body", ["glimpse", "vit"])
-def test_a_network_learns_a_few_scenes_by_heart(
-    examples: Examples, body: Literal["glimpse", "vit"]
-) -> None:
-    model = ModelConfig(body=body, width=64, heads=2, layers=1, channels=16, hidden=64)
+@pytest.mark.parametrize("body", list(SMALL))
+def test_a_network_learns_a_few_scenes_by_heart(examples: Examples, body: str) -> None:
+    model = SMALL[body]
     config = replace(
         CONFIG,
         model=model,
@@ -332,148 +278,27 @@ def test_rate_rises_then_falls(examples: Examples) -> None:
     assert rates[105] == pytest.approx(CONFIG.learning_rate / 2, rel=1e-6)
 
 
-# --- checkpoints --------------------------------------------------------------------------
+def test_loss_by_hand() -> None:
+    scores = torch.tensor([2.0, -1.0, 0.5, 9.0])
+    relevant = torch.tensor([True, True, False, True])
+    mask = torch.tensor([True, True, True, False])
+    p = [1 / (1 + math.exp(-s)) for s in (2.0, -1.0, 0.5)]
+    by_hand = -(0.86 * math.log(p[0]) + 0.86 * math.log(p[1]) + 0.14 * math.log(1 - p[2])) / 3
+    assert float(relevance_loss(scores, relevant, mask, 0.86)) == pytest.approx(by_hand, abs=1e-6)
+    # missing a relevant object costs more than keeping an irrelevant one
+    missed = relevance_loss(torch.tensor([-1.0]), torch.ones(1), torch.ones(1), 0.86)
+    kept = relevance_loss(torch.tensor([1.0]), torch.zeros(1), torch.ones(1), 0.86)
+    assert float(missed / kept) == pytest.approx(0.86 / 0.14, rel=1e-5)
 
 
-def weights(path: Path) -> dict[str, torch.Tensor]:
-    return load_checkpoint(path)[0].state_dict()
-
-
-def equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
-
-
-def test_train_writes_a_checkpoint_and_its_row(root: Path) -> None:
-    ticks: list[tuple[int, int]] = []
-    path = train(root, CONFIG, progress=lambda done, total: ticks.append((done, total)))
-    assert ticks == [(i, 6) for i in range(1, 7)]
-    dataset = Dataset.open(root)
-    (row,) = dataset.read_rows("checkpoints")
-    assert root / row["path"] == path
-    assert path.stem == row["checkpoint_id"]
-    assert sorted(p.name for p in path.parent.iterdir()) == [f"{path.stem}.parquet", path.name]
-    model, meta = load_checkpoint(path)
-    assert meta["dataset_hash"] == row["dataset_hash"] == dataset.content_hash()
-    assert TrainConfig.from_dict(meta["config"]) == CONFIG
-    assert meta["metrics"] == json.loads(row["metrics"])
-    assert set(meta["metrics"]) == {*(p.name for p in PREDICATES.values()), "same-plane"}
-    validation = load_examples(dataset, "validation", camera=Camera())
-    assert measure(model, validation) == meta["metrics"], "the file holds the trained weights"
-    assert [entry["step"] for entry in meta["history"]] == [1, 2, 3, 4, 5, 6]
-    stamp = path.stat().st_mtime_ns
-    assert train(root, CONFIG) == path
-    assert path.stat().st_mtime_ns == stamp, "a finished run is not repeated"
-    dataset.shard_path("checkpoints", name=path.stem).unlink()
-    train(root, CONFIG)
-    assert dataset.read_rows("checkpoints") == [row], "a row lost in a kill comes back"
-
-
-def test_identity_is_the_config_and_the_data_but_not_the_execution(root: Path) -> None:
-    config = replace(CONFIG, steps=1)
-    path = train(root, config)
-    assert train(root, replace(config, threads=2, save_every=7, cache_bytes=0)) == path
-    assert train(root, replace(config, seed=1)) != path
-    assert not equal(weights(path), weights(train(root, replace(config, seed=1))))
-    dataset = Dataset.open(root)
-    labels = dataset.read_rows("labels", split="train", shard=0, predicate="behind")
-    labels[0]["relevant"] = not labels[0]["relevant"]
-    dataset.write_rows("labels", labels, split="train", shard=0, predicate="behind")
-    assert train(root, config) != path
-
-
-def test_files_in_another_folder(root: Path, tmp_path: Path) -> None:
-    path = train(root, replace(CONFIG, steps=1), out=tmp_path / "elsewhere")
-    assert path.parent == tmp_path / "elsewhere"
-    (row,) = Dataset.open(root).read_rows("checkpoints")
-    assert Path(row["path"]) == path.resolve()
-
-
-def test_a_killed_run_ends_with_the_same_weights(root: Path, made: Path, tmp_path: Path) -> None:
-    config = replace(CONFIG, steps=24, save_every=3)
-    code = (
-        "import sys, json; from relevance.training import TrainConfig, train;"
-        "train(sys.argv[1], TrainConfig.from_dict(json.loads(sys.argv[2])))"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, str(root), json.dumps(config.to_dict())],
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
-    folder, limit = root / "checkpoints", time.monotonic() + 120
-    while not list(folder.glob("*.state")):
-        assert process.poll() is None, "training ended before it saved a state"
-        assert time.monotonic() < limit, "no state was saved"
-        time.sleep(0.01)
-    os.kill(process.pid, signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL
-    assert not list(folder.glob("*.pt")), "killed before the end"
-    ticks: list[int] = []
-    resumed = train(root, config, progress=lambda done, total: ticks.append(done))
-    assert ticks[0] > 3, "goes on from the saved state"
-    assert ticks[-1] == 24
-    assert not list(folder.glob("*.state"))
-    whole = train(Path(shutil.copytree(made, tmp_path / "again")), config)
-    assert equal(weights(resumed), weights(whole))
-    histories = [load_checkpoint(path)[1]["history"] for path in (resumed, whole)]
-    assert histories[0] == histories[1]
-
-
-def test_nothing_to_learn_from(root: Path) -> None:
-    shutil.rmtree(root / "labels")
-    with pytest.raises(DatasetError, match="no labels with split train and policy found"):
-        train(root, CONFIG)
-    assert not (root / "checkpoints").exists()
-    with pytest.raises(DatasetError, match=r"no dataset\.json there"):
-        train(root / "nowhere", CONFIG)
-
-
-def test_no_validation_labels_means_no_metrics(root: Path) -> None:
-    for folder in (root / "labels").glob("predicate=*/split=validation"):
-        shutil.rmtree(folder)
-    assert load_checkpoint(train(root, replace(CONFIG, steps=1)))[1]["metrics"] == {}
-
-
-def test_labels_of_a_missing_scene(root: Path) -> None:
-    dataset = Dataset.open(root)
-    rows = dataset.read_rows("labels", split="train", shard=0, predicate="behind")
-    rows = [row | {"scene_id": "0000"} for row in rows]
-    dataset.write_rows("labels", rows, split="train", shard=0, predicate="behind")
-    with pytest.raises(DatasetError, match="labels of split train name scene 0000, which no image"):
-        train(root, CONFIG)
-
-
-def refused(path: Path) -> str:
-    with pytest.raises(CheckpointError) as error:
-        load_checkpoint(path)
-    message = str(error.value)
-    assert str(path) in message
-    assert "\n" not in message
-    assert "expected" in message
-    return message
-
-
-def test_checkpoint_errors(root: Path) -> None:
-    path = train(root, replace(CONFIG, steps=1))
-    whole = path.read_bytes()
-    assert "no such file" in refused(path.parent / "none.pt")
-    for size in (0, 10, len(whole) // 2, len(whole) - 1):
-        path.write_bytes(whole[:size])
-        assert "truncated or not a checkpoint" in refused(path)
-    path.write_bytes(b"not a checkpoint at all")
-    assert "truncated or not a checkpoint" in refused(path)
-    path.write_bytes(whole)
-    content = torch.load(path, weights_only=True)
-    torch.save({**content, "version": 99}, path)
-    assert "schema version 99, expected schema version 1" in refused(path)
-    torch.save([1, 2], path)
-    assert "schema version None, expected schema version 1" in refused(path)
-    torch.save({**content, "kind": "state"}, path)
-    assert "holds a state, expected a checkpoint" in refused(path)
-    torch.save({**content, "model": {}}, path)
-    assert "does not fit its weights" in refused(path)
-    meta = {**content["meta"], "config": {**content["meta"]["config"], "depth": 3}}
-    torch.save({**content, "meta": meta}, path)
-    assert "depth" in refused(path)
-    assert "no such file" not in refused(path.parent), "a folder is no checkpoint"
+def test_loss_of_nothing_is_zero_and_of_extreme_scores_finite() -> None:
+    scores = torch.tensor([400.0, -400.0], requires_grad=True)
+    assert relevance_loss(scores, torch.zeros(2), torch.zeros(2), 0.7).item() == 0.0
+    loss = relevance_loss(scores, torch.tensor([0.0, 1.0]), torch.ones(2), 0.7)
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert scores.grad is not None
+    assert torch.isfinite(scores.grad).all()
 
 
 # --- metrics and config -------------------------------------------------------------------
@@ -525,11 +350,11 @@ def test_measure_counts_queries_and_goals(examples: Examples, made: Path) -> Non
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"steps": 0}, "TrainConfig.steps is 0, expected at least 1"),
-        ({"learning_rate": 0.0}, "TrainConfig.learning_rate is 0.0, expected more than 0"),
-        ({"eta_on": 1.0}, "TrainConfig.eta_on is 1.0, expected between 0 and 1"),
-        ({"warmup": 1.0}, "TrainConfig.warmup is 1.0, expected a share below 1"),
-        ({"bfloat16": "maybe"}, "TrainConfig.bfloat16 is 'maybe', expected auto, on or off"),
+        ({"steps": 0}, r"TrainConfig\.steps = 0: expected greater than or equal to 1"),
+        ({"learning_rate": 0.0}, r"TrainConfig\.learning_rate = 0\.0: expected greater than 0"),
+        ({"eta_on": 1.0}, r"TrainConfig\.eta_on = 1\.0: expected less than 1"),
+        ({"warmup": 1.0}, r"TrainConfig\.warmup = 1\.0: expected less than 1"),
+        ({"bfloat16": "maybe"}, r"TrainConfig\.bfloat16 = 'maybe': expected 'auto', 'on' or 'off'"),
     ],
 )
 def test_config_refuses(change: dict, message: str) -> None:
@@ -537,10 +362,47 @@ def test_config_refuses(change: dict, message: str) -> None:
         TrainConfig(**change)
 
 
+def test_only_what_decides_the_weights_is_in_the_identity() -> None:
+    """A setting that has its default, a word for people, or how it is run names nothing."""
+    named = CONFIG.content_hash
+    for change in (
+        {"preset": "laptop"},
+        {"threads": 2},
+        {"save_every": 7},
+        {"cache_bytes": 0},
+        {"device": "cuda"},
+        {"weight_decay": 0.02},
+    ):
+        assert replace(CONFIG, **change).content_hash == named
+    vit = replace(CONFIG, model=VitConfig())
+    glimpse = replace(CONFIG, model=GlimpseConfig())
+    hashes = {named, vit.content_hash, glimpse.content_hash, replace(vit, seed=1).content_hash}
+    assert len(hashes) == 4
+
+
+def test_a_new_version_of_a_body_renames_its_own_checkpoints_only(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    vit = replace(CONFIG, model=VitConfig())
+    before = CONFIG.content_hash, vit.content_hash
+    kind = replace(BODIES["vit"], version="next")
+    monkeypatch.setitem(BODIES._items, "vit", kind)
+    assert CONFIG.content_hash == before[0]
+    assert vit.content_hash != before[1]
+
+
+def test_another_body_takes_the_sizes_of_the_preset() -> None:
+    assert TrainConfig.smoke().with_body("vit").model == VitConfig.smoke()
+    assert TrainConfig.demo().with_body("vit").model == VitConfig()
+    assert TrainConfig.paper().with_body("glimpse").model == GlimpseConfig.paper()
+    assert CONFIG.with_body("glimpse") == CONFIG
+    with pytest.raises(ValueError, match="unknown body 'cnn', expected one of glimpse, vit"):
+        CONFIG.with_body("cnn")
+
+
 def test_presets_survive_plain_values() -> None:
     for config in (TrainConfig.smoke(), TrainConfig.demo(), TrainConfig.laptop()):
         assert TrainConfig.from_dict(config.to_dict()) == config
     paper = TrainConfig.from_dict(TrainConfig.paper().to_dict())
-    assert paper.model.body == "vit"
-    assert paper.model.width == 768
+    assert paper.model == VitConfig.paper()
     assert TrainConfig.demo().content_hash != TrainConfig.smoke().content_hash

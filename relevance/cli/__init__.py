@@ -83,7 +83,8 @@ def _run(name: str, rest: list[str]) -> int:
         known = ", ".join(targets or COMMANDS)
         raise UsageError(f"unknown command {name!r}, expected one of {known}")
     command = COMMANDS[name]
-    run = command.make(_preset(rest, command.preset))
+    decided = (_value(rest, flag) for flag in command.decides)
+    run = command.make(_preset(rest, command.preset), *decided)
     about = "\n".join([(run.__doc__ or "").partition("Args:")[0].strip(), "", "examples:"])
     about += "".join(f"\n  {example}" for example in command.examples)
     return _parse(name, run, f"{about}\n\n{CODES}", rest)()
@@ -117,14 +118,21 @@ def _first(page: str) -> str:
 def _preset(arguments: Sequence[str], default: Preset) -> Preset:
     """The preset on the command line, read first since the other defaults depend on it."""
     known: dict[str, Preset] = {name: name for name in get_args(Preset)}
-    for flag, following in itertools.zip_longest(arguments, arguments[1:]):
-        name, sign, inline = flag.partition("=")
-        if name == "--preset":
-            value = inline if sign else following
-            if value not in known:
-                raise UsageError(f"--preset {value}: expected one of {', '.join(known)}")
-            return known[value]
-    return default
+    value = _value(arguments, "--preset")
+    if value is None:
+        return default
+    if value not in known:
+        raise UsageError(f"--preset {value}: expected one of {', '.join(known)}")
+    return known[value]
+
+
+def _value(arguments: Sequence[str], flag: str) -> str | None:
+    """What is given to a flag; None without it."""
+    for argument, following in itertools.zip_longest(arguments, arguments[1:]):
+        name, sign, inline = argument.partition("=")
+        if name == flag:
+            return inline if sign else following or ""
+    return None
 
 
 def _help(commands: Mapping[str, Command] = COMMANDS) -> str:

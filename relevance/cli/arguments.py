@@ -26,10 +26,12 @@ MOST_WORKERS = 1024
 class Command:
     """A subcommand: what makes its function, what it does in a few words, examples."""
 
-    make: Callable[[Preset], Callable[..., int]]
+    make: Callable[..., Callable[..., int]]
     about: str
     examples: tuple[str, ...]
     preset: Preset = "demo"
+    decides: tuple[str, ...] = ()
+    """Flags whose values `make` takes after the preset: other flags depend on them."""
 
 
 def at_least(flag: str, value: float | None, least: float, most: float = math.inf) -> None:

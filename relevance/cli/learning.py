@@ -10,10 +10,12 @@ from relevance.cli.arguments import Command, DatasetArg, OptionalPath, Preset
 from relevance.cli.terminal import bar, say
 
 
-def _train(preset: Preset) -> Callable[..., int]:
+def _train(preset: Preset, body: str | None = None) -> Callable[..., int]:
     from relevance.training import TrainConfig
 
     start: TrainConfig = getattr(TrainConfig, preset)()
+    if body is not None:
+        start = start.with_body(body)
 
     # --preset is a setting of TrainConfig itself.
     def train(
@@ -52,14 +54,14 @@ def _evaluate(preset: Preset) -> Callable[..., int]:
 
         Args:
             dataset: Folder of a labelled dataset.
-            checkpoint: The model; the dataset's newest when not given.
+            checkpoint: The model, a file or an id; the dataset's newest when not given.
             preset: Where the other settings start from.
         """
         from relevance import evaluation
-        from relevance.training.checkpoints import newest_checkpoint
+        from relevance.training import find_checkpoint
 
-        path = checkpoint or newest_checkpoint(dataset)
-        checkpoint_id = evaluation.load_scorer(path).checkpoint_id
+        path = find_checkpoint(dataset, checkpoint)
+        checkpoint_id = evaluation.checkpoint_id(path)
         with bar("shards scored") as progress:
             scored = evaluation.predict(dataset, path, split=config.split, progress=progress)
         with bar("tasks") as progress:
@@ -76,8 +78,9 @@ COMMANDS = {
         about="a relevance model",
         examples=(
             "relevance train data/tables --preset laptop",
-            "relevance train data/tables --steps 3000 --model.body vit",
+            "relevance train data/tables --steps 3000 --model.body vit --model.width 64",
         ),
+        decides=("--model.body",),
     ),
     "evaluate": Command(
         make=_evaluate,

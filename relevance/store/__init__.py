@@ -6,7 +6,7 @@ The only importer of pyarrow, duckdb and webdataset.
 from relevance.store.compacting import compact
 from relevance.store.dataset import Dataset
 from relevance.store.exporting import export
-from relevance.store.files import SPLITS, Source, differences
+from relevance.store.files import SPLITS, Files, Source, differences
 from relevance.store.images import MEMBERS, VIEW_SIZE, Pictures, Sample, decode, undecoded
 from relevance.store.labellings import Labelling
 from relevance.store.parquet import empty_size
@@ -40,6 +40,7 @@ __all__ = [
     "Column",
     "Dataset",
     "DatasetError",
+    "Files",
     "Labelling",
     "Pictures",
     "Sample",

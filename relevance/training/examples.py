@@ -22,7 +22,8 @@ from torch import Tensor
 
 from relevance.models import DECIMETRE, GEOMETRY, PATCH, STRIDE, half_extents, mirrored
 from relevance.scene import PREDICATES, Camera, Predicate, Scene
-from relevance.store import Dataset, DatasetError
+from relevance.store import Dataset, DatasetError, Files
+from relevance.training.settings import TrainConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,6 +79,20 @@ class Batch:
     turns: tuple[tuple[Predicate, Tensor, Tensor, Tensor], ...]
     """Predicate, goals (B, G, 2), relevant (B, G, N), labelled (B, G, N; False for padding)."""
 
+    def to(self, device: torch.device) -> Batch:
+        """The same, there."""
+        return Batch(
+            image=self.image.to(device),
+            views=self.views.to(device),
+            present=self.present.to(device),
+            cells=self.cells.to(device),
+            geometry=self.geometry.to(device),
+            turns=tuple(
+                (p, goals.to(device), relevant.to(device), labelled.to(device))
+                for p, goals, relevant, labelled in self.turns
+            ),
+        )
+
 
 def load_examples(
     dataset: Dataset,
@@ -91,10 +106,11 @@ def load_examples(
 ) -> Examples:
     """Read the labels of a split and decode the scenes that they are about.
 
-    Raises DatasetError for a broken file, a label about a scene that is not there, or an image
-    of another size than the camera's. Arrays over `cache_bytes` are mapped from a nameless
-    file in `folder`.
+    Raises DatasetError for a broken file, labels that were not all made in one way, a label about
+    a scene that is not there, or an image of another size than the camera's. Arrays over
+    `cache_bytes` are mapped from a nameless file in `folder`.
     """
+    one_labelling(dataset, split, policy)
     query = """
         select scene_id, predicate, subject, reference, list(query order by query),
             list(relevant order by query)
@@ -154,6 +170,29 @@ def load_examples(
         present=present,
         goals=goals,
     )
+
+
+def one_labelling(dataset: Files, split: str, policy: str) -> None:
+    """Raise DatasetError unless the labels of a split were all made as the dataset says.
+
+    While a dataset is planned anew, some are not.
+    """
+    for source in dataset.sources:
+        one_labelling(source.dataset, split, policy)
+    if dataset.sources:
+        return
+    current = dataset.labelling
+    of = None if current is None or current.policy == policy else replace(current, policy=policy)
+    wanted = {} if current is None else replace(current, policy=policy).made_by
+    for file in dataset.files("labels", of=of, split=split):
+        made = dataset.metadata(file)
+        for key in ("planner", "config", "policy"):
+            expected = wanted.setdefault(key, made.get(key, ""))
+            if made.get(key, expected) != expected:
+                raise DatasetError(
+                    f"{file}: made by {key} {made[key]}, expected {expected} as all labels of "
+                    f"split {split}; `relevance label` finishes what was begun"
+                )
 
 
 def true_geometry(scene: Scene) -> np.ndarray:
@@ -228,4 +267,50 @@ def in_the_mirror(batch: Batch) -> Batch:
         cells=batch.cells.flip(-1),
         geometry=mirrored(batch.geometry),
         turns=tuple((PREDICATES[turn[0].mirror], *turn[1:]) for turn in batch.turns),
+    )
+
+
+# --- polling: which scenes and goals a step sees ---------------------------------------
+
+
+def polling(predicates: Sequence[Predicate], *, share: bool) -> list[tuple[Predicate, ...]]:
+    """One round of turns p0, p1, ...: the predicates of each optimiser step, in order.
+
+    With `share`, neighbours of one scene family make one step; the order stays the same.
+    """
+    if not share:
+        return [(predicate,) for predicate in predicates]
+    return [tuple(group) for _, group in groupby(predicates, key=lambda p: p.family)]
+
+
+def draw_batch(examples: Examples, config: TrainConfig, step: int) -> Batch:
+    """The batch of a step: a pure function of the examples, the config and the step.
+
+    Step s takes group s mod n of the polling round. Each group goes through its own scenes in
+    an order of its own, all of them before any comes again.
+    """
+    groups = polling(list(examples.goals), share=config.share_encodings)
+    predicates, visit = groups[step % len(groups)], step // len(groups)
+    scenes = examples.scenes(predicates)
+    stream = list(PREDICATES.values()).index(predicates[0])
+    wanted = np.arange(visit * config.scenes_per_batch, (visit + 1) * config.scenes_per_batch)
+    epochs, places = np.divmod(wanted, len(scenes))
+    orders = {
+        epoch: _rng(config.seed, 1, stream, epoch).permutation(len(scenes))
+        for epoch in set(epochs.tolist())
+    }
+    chosen = np.array([scenes[orders[e][p]] for e, p in zip(epochs, places, strict=True)])
+    rng = _rng(config.seed, 2, 0, step)
+    channels = rng.permutation(3) if config.recolor else None
+    flip = config.mirror and bool(rng.integers(2))
+    batch = gather(examples, chosen, predicates, limit=config.goals_per_scene, rng=rng)
+    if channels is not None:
+        order = torch.from_numpy(channels)
+        batch = replace(batch, image=batch.image[:, order], views=batch.views[:, :, order])
+    return in_the_mirror(batch) if flip else batch
+
+
+def _rng(seed: int, purpose: int, stream: int, index: int) -> np.random.Generator:
+    return np.random.Generator(
+        np.random.Philox(key=seed, counter=[0, int(index), int(stream), purpose])
     )

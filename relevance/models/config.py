@@ -1,0 +1,75 @@
+"""What every body has in common: settings, the size of pictures, and what seeing a scene gives.
+
+Shape suffixes: B scenes, N objects (padded), D width, h and w height and width of the stride-4
+feature map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Self
+
+from pydantic import model_validator
+from torch import Tensor
+
+from relevance.configs import config
+from relevance.errors import RelevanceError
+from relevance.scene import Camera
+
+PATCH = 32
+"""Edge of image patches and canonical views, pixels (the paper's)."""
+STRIDE = 4
+"""Image pixels per cell of the feature map on which objects are matched and masks are kept."""
+
+
+class ModelError(RelevanceError):
+    """A question that a model cannot answer: says which, and what it was made for."""
+
+
+@config
+class ModelConfig:
+    """What a body is told; each has its own class of this kind, with its sizes."""
+
+    body: str = ""
+    """The body that these settings are of: glimpse, vit, ... (`relevance.models.BODIES`)."""
+    camera: Camera = field(default_factory=Camera)
+    """Image size, and the sight lines that give the first guess of a position."""
+
+    @model_validator(mode="after")
+    def _whole_patches(self) -> Self:
+        if self.camera.height % PATCH or self.camera.width % PATCH:
+            raise ValueError(
+                f"image is {self.camera.width}x{self.camera.height}, "
+                f"expected multiples of {PATCH} pixels"
+            )
+        return self
+
+    @classmethod
+    def smoke(cls) -> Self:
+        """The smallest that runs; the defaults where a body does not say."""
+        return cls()
+
+    @classmethod
+    def paper(cls) -> Self:
+        """The paper's sizes; the defaults for a body that the paper does not have."""
+        return cls()
+
+
+def divides(width: int, heads: int) -> None:
+    """Raise ValueError unless the attention heads share the width evenly."""
+    if width % heads:
+        raise ValueError(f"width is {width}, expected a multiple of heads {heads}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Encoding:
+    """A batch of scenes, seen once; all that `decode` and the auxiliary losses need."""
+
+    tokens: Tensor
+    """(B, N, D), one token an object."""
+    present: Tensor
+    """(B, N) bool; False for padding."""
+    geometry: Tensor | None = None
+    """(B, N, GEOMETRY) estimated geometry, decimetres (glimpse)."""
+    match: Tensor | None = None
+    """(B, N, h*w) logits of where the object is in the feature map (glimpse)."""

@@ -1,0 +1,220 @@
+"""Our own body: find each object by its view, look at it closely, then reason about the goal.
+
+Shape suffixes: B scenes, N objects (padded), G goals, P cells of the stride-4 feature map,
+D width, E channels, H and W height and width in pixels, h and w the same at stride 4.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Literal, Self
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from relevance.configs import config
+from relevance.models.config import PATCH, STRIDE, Encoding, ModelConfig, divides
+from relevance.models.layers import Attention, columns, pick, small_cnn
+from relevance.models.poses import ANGLES, DECIMETRE, GEOMETRY
+from relevance.models.registry import BODIES, Body, BodyKind
+from relevance.scene import Camera, Predicate, Robot, camera_up
+
+ROBOT = Robot()
+"""Whose axes the directions of goals are: every picture was taken in front of this one."""
+_GROUND = 0.035
+"""Height at which a sight line is cut for a first guess of the position, m: half a box."""
+
+
+@config
+class GlimpseConfig(ModelConfig):
+    """Sizes of the matching, the glimpses and the layers over the objects."""
+
+    body: Literal["glimpse"] = "glimpse"
+    """The body that these settings are of."""
+    width: Annotated[int, Field(ge=1)] = 128
+    """D, width of the object tokens."""
+    heads: Annotated[int, Field(ge=1)] = 4
+    """Attention heads; divides width."""
+    layers: Annotated[int, Field(ge=1)] = 2
+    """Attention layers over the objects given the goal."""
+    channels: Annotated[int, Field(ge=2)] = 32
+    """E, channels of the stride-4 feature map."""
+    window: Annotated[int, Field(ge=1)] = 56
+    """Edge of the image window around a matched object, pixels."""
+
+    @model_validator(mode="after")
+    def _even(self) -> Self:
+        divides(self.width, self.heads)
+        return self
+
+    @classmethod
+    def smoke(cls) -> Self:
+        """The smallest that runs."""
+        return cls(width=32, heads=2, layers=1, channels=8)
+
+
+class GlimpseBody(Body):
+    """Find each object, look at it closely, then reason about the goal over all objects.
+
+    Match: dot product of the view's embedding with a stride-4 feature map; softmax and
+    soft-argmax in float32 say where the object is. Glimpse: the image window there,
+    resampled to 32x32, goes through a small CNN together with the match map of the same
+    window. Geometry (position, size, footprint half-extents) is estimated from both and
+    given to the goal layers in the goal's own axes: along and across the predicate's
+    direction, from the reference and from the subject.
+    """
+
+    def __init__(self, config: GlimpseConfig, predicates: Sequence[str]) -> None:
+        super().__init__()
+        width, channels = config.width, config.channels
+        self.window, self.camera = config.window, config.camera
+        # Space-to-depth first: at stride 4 a 3x3 convolution is cheap and no pixel is lost.
+        self.scene = nn.Sequential(
+            nn.PixelUnshuffle(STRIDE),
+            nn.Conv2d(3 * STRIDE**2, channels, 1),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 1),
+        )
+        self.view = small_cnn(3, (channels // 2, channels, channels), width)
+        self.view_key = nn.Linear(width, channels)
+        self.sharpness = nn.Parameter(torch.tensor(2.5))
+        self.look = small_cnn(4, (24, 48, 64), width)
+        seen = 2 * width + 4
+        self.estimate = nn.Sequential(nn.Linear(seen, width), nn.GELU(), nn.Linear(width, GEOMETRY))
+        self.token = nn.Sequential(nn.Linear(seen + GEOMETRY, width), nn.GELU())
+        self.among = Attention(width, config.heads, expansion=2)
+        self.place = nn.Sequential(
+            nn.Linear(_GOAL_FEATURES, width), nn.GELU(), nn.Linear(width, width)
+        )
+        self.predicate = nn.ParameterDict(
+            {name: nn.Parameter(torch.zeros(width)) for name in predicates}
+        )
+        self.goal_layers = nn.ModuleList(
+            Attention(width, config.heads, expansion=2) for _ in range(config.layers)
+        )
+        self.heads = nn.ModuleDict(
+            {
+                name: nn.Sequential(
+                    nn.LayerNorm(width), nn.Linear(width, width), nn.GELU(), nn.Linear(width, 1)
+                )
+                for name in predicates
+            }
+        )
+        self.cells_P2: Tensor
+        self.register_buffer("cells_P2", _cell_centres(config.camera), persistent=False)
+
+    def encode(self, image: Tensor, views: Tensor, present: Tensor) -> Encoding:
+        """As `RelevanceModel.encode`, inputs float in 0..1."""
+        batch, objects = views.shape[:2]
+        features_BEP = self.scene(image - 0.5).flatten(2)
+        view_BND = self.view((views - 0.5).flatten(0, 1)).view(batch, objects, -1)
+        key_BNE = self.view_key(view_BND)
+        with torch.autocast(image.device.type, enabled=False):
+            # Cosine similarity; positions are read to a fraction of a pixel, hence float32.
+            features_BEP = features_BEP.float()
+            norm_B1P = features_BEP.square().sum(1, keepdim=True).clamp(min=1e-6).rsqrt()
+            key_BNE = F.normalize(key_BNE.float(), dim=-1) * self.sharpness.exp()
+            match_BNP = key_BNE @ features_BEP * norm_B1P
+            where_BNP = match_BNP.softmax(-1)
+            centre_BN2 = where_BNP @ self.cells_P2
+        window = self._window(image, where_BNP.detach(), centre_BN2.detach())
+        look_BND = self.look(window).view(batch, objects, -1)
+        ground_BN2 = _on_the_ground(centre_BN2, self.camera)
+        seen = torch.cat([view_BND, look_BND, centre_BN2, ground_BN2], dim=-1)
+        geometry = self.estimate(seen).float()
+        geometry = torch.cat([geometry[..., :2] + ground_BN2, geometry[..., 2:]], dim=-1)
+        tokens = self.token(torch.cat([seen, geometry], dim=-1))
+        tokens = self.among(tokens, columns(present))
+        return Encoding(tokens=tokens, present=present, geometry=geometry, match=match_BNP)
+
+    def _window(self, image: Tensor, where_BNP: Tensor, centre_BN2: Tensor) -> Tensor:
+        """Windows around the centres, (B*N, 4, 32, 32): colours and match map."""
+        batch, objects = where_BNP.shape[:2]
+        height, width = image.shape[-2:]
+        step = (torch.arange(PATCH, device=image.device) + 0.5) / PATCH * 2 - 1
+        offset = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1)
+        offset = offset * offset.new_tensor([self.window / width, self.window / height])
+        grid = centre_BN2[:, :, None, None] + offset
+        colours = F.grid_sample(
+            image - 0.5, grid.view(batch, objects * PATCH, PATCH, 2), align_corners=False
+        )
+        colours = colours.view(batch, 3, objects, PATCH, PATCH).transpose(1, 2)
+        shape = (batch * objects, 1, height // STRIDE, width // STRIDE)
+        peak = (where_BNP / where_BNP.amax(-1, keepdim=True)).view(shape)
+        heat = F.grid_sample(peak, grid.view(-1, PATCH, PATCH, 2), align_corners=False)
+        return torch.cat([colours.reshape(-1, 3, PATCH, PATCH), heat], dim=1)
+
+    def decode(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
+        """As `RelevanceModel.decode`."""
+        assert encoding.geometry is not None
+        tokens, present = encoding.tokens, encoding.present
+        batch, objects = present.shape
+        features = _goal_features(encoding.geometry, predicate, goals)
+        x = tokens[:, None] + self.place(features) + self.predicate[predicate.name]
+        x = x.flatten(0, 1)
+        allowed = columns(present).repeat_interleave(goals.shape[1], dim=0)
+        for layer in self.goal_layers:
+            x = layer(x, allowed)
+        return self.heads[predicate.name](x).view(batch, -1, objects)
+
+
+_GOAL_FEATURES = 3 * GEOMETRY + 2 + 2 * 8
+
+
+def _goal_features(geometry: Tensor, predicate: Predicate, goals: Tensor) -> Tensor:
+    """Where every object is as the goal sees it, (B, G, N, _GOAL_FEATURES).
+
+    Axes: along and across the predicate's direction (x and y for `on`). Own geometry, the
+    subject's, the reference's, two role flags, and for subject and reference the distance
+    and the signed clearance of the footprints along both axes: what "beside" turns on.
+    """
+    u = predicate.direction(ROBOT) or (1.0, 0.0)
+    axes = geometry.new_tensor([[u[0], u[1]], [-u[1], u[0]]])
+    # Extents along the goal's axes: those of the regressed directions that are nearest.
+    turn = round(math.atan2(u[1], u[0]) / (math.pi / ANGLES))
+    extents = geometry[..., 6:].roll(-turn, dims=-1)
+    place = torch.cat([geometry[..., :2] @ axes.T, geometry[..., 2:6], extents], dim=-1)
+    objects, count = place.shape[1], goals.shape[1]
+    own = place[:, None].expand(-1, count, -1, -1)
+    roles = torch.arange(objects, device=goals.device)[:, None] == goals[..., None, :]
+    features = [own, roles.to(place.dtype)]
+    for role in range(2):
+        anchor = pick(place, goals[..., role])[:, :, None]
+        delta = own[..., :3] - anchor[..., :3]
+        reach = (own + anchor)[..., [6, 6 + ANGLES // 2]]
+        apart = delta[..., :2].abs()
+        clear = apart - reach
+        features += [anchor.expand_as(own), delta, apart, clear, clear.amax(-1, keepdim=True)]
+    return torch.cat(features, dim=-1)
+
+
+def _cell_centres(camera: Camera) -> Tensor:
+    """Centres of the stride-4 cells, (h*w, 2): u right and v down, each in -1..1."""
+    u = (torch.arange(camera.width // STRIDE) + 0.5) * (2 * STRIDE / camera.width) - 1
+    v = (torch.arange(camera.height // STRIDE) + 0.5) * (2 * STRIDE / camera.height) - 1
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(-1, 2)
+
+
+def _on_the_ground(centre: Tensor, camera: Camera) -> Tensor:
+    """Where the sight lines through (u, v) cut the plane z = _GROUND: x, y in decimetres."""
+    eye, target, above = (
+        centre.new_tensor(vector) for vector in (camera.eye, camera.target, camera_up(camera))
+    )
+    forward = F.normalize(target - eye, dim=0)
+    right = F.normalize(torch.linalg.cross(forward, above), dim=0)
+    up = torch.linalg.cross(right, forward)
+    tangent = math.tan(math.radians(camera.fov) / 2)
+    u = centre[..., :1] * tangent
+    v = centre[..., 1:] * (tangent * camera.height / camera.width)
+    ray = forward + u * right - v * up
+    # Sight lines at or above the horizon hit nothing; they are cut far away instead.
+    along = (_GROUND - camera.eye[2]) / ray[..., 2:].clamp(max=-0.1)
+    return (eye[:2] + along * ray[..., :2]) / DECIMETRE
+
+
+BODIES.register("glimpse", BodyKind(config=GlimpseConfig, make=GlimpseBody, version="1"))

@@ -1,0 +1,82 @@
+"""Layers that more than one body is made of.
+
+Shape suffixes: B scenes, N objects (padded), G goals, L tokens, D width.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from relevance.models.config import PATCH
+
+
+class Attention(nn.Module):
+    """Pre-norm transformer layer on `scaled_dot_product_attention`, with our own masks."""
+
+    def __init__(self, width: int, heads: int, expansion: int = 4) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm_in, self.norm_mid = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.qkv, self.out = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.mlp = nn.Sequential(
+            nn.Linear(width, expansion * width), nn.GELU(), nn.Linear(expansion * width, width)
+        )
+
+    def forward(self, x: Tensor, allowed: Tensor) -> Tensor:
+        """x (B, L, D); allowed (B or 1, L, L) bool: row may look at column."""
+        batch, length, width = x.shape
+        qkv = self.qkv(self.norm_in(x)).view(batch, length, 3, self.heads, width // self.heads)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4)
+        seen = F.scaled_dot_product_attention(q, k, v, attn_mask=allowed[:, None])
+        x = x + self.out(seen.transpose(1, 2).reshape(batch, length, width))
+        return x + self.mlp(self.norm_mid(x))
+
+
+class Extractor(nn.Module):
+    """The paper's predicate extractor: [subject, reference, query] -> two hidden layers -> score.
+
+    The first layer is three matrices, one a role, so each object goes through each only once.
+    """
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.subject = nn.Linear(width, hidden)
+        self.reference = nn.Linear(width, hidden, bias=False)
+        self.query = nn.Linear(width, hidden, bias=False)
+        self.second, self.score = nn.Linear(hidden, hidden), nn.Linear(hidden, 1)
+
+    def forward(self, tokens: Tensor, goals: Tensor) -> Tensor:
+        """Scores (B, G, N) from tokens (B, N, D) for goals (B, G, 2)."""
+        pair = pick(self.subject(tokens), goals[..., 0])
+        pair = pair + pick(self.reference(tokens), goals[..., 1])
+        hidden = F.relu(pair[:, :, None] + self.query(tokens)[:, None])
+        return self.score(F.relu(self.second(hidden))).squeeze(-1)
+
+
+def small_cnn(channels: int, widths: tuple[int, int, int], width: int) -> nn.Sequential:
+    """A 32x32 picture to a vector of `width`."""
+    a, b, c = widths
+    return nn.Sequential(
+        nn.Conv2d(channels, a, 4, stride=2, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(a, b, 4, stride=2, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(b, c, 4, stride=2, padding=1),
+        nn.ReLU(),
+        nn.Flatten(),
+        nn.Linear(c * (PATCH // 8) ** 2, width),
+        nn.ReLU(),
+    )
+
+
+def pick(x: Tensor, index: Tensor) -> Tensor:
+    """Rows of x (B, N, D) at index (B, G): (B, G, D)."""
+    return x.gather(1, index[..., None].expand(-1, -1, x.shape[-1]))
+
+
+def columns(present: Tensor) -> Tensor:
+    """Attention mask (B, N, N): everyone may look at the objects that exist, and at itself."""
+    itself = torch.eye(present.shape[1], dtype=torch.bool, device=present.device)
+    return present[:, None, :] | itself

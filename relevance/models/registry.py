@@ -1,0 +1,120 @@
+"""Bodies by name, and the model that is one of them with a head for each predicate.
+
+A body is one file of this package: its settings (a `ModelConfig`), its network (a `Body`) and
+the line that registers both. The files are found by being there.
+
+Shape suffixes: B scenes, N objects (padded), G goals, H and W height and width in pixels.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from relevance.models.config import Encoding, ModelConfig, ModelError
+from relevance.registry import Registry
+from relevance.scene import PREDICATES, Predicate
+
+
+class Body(nn.Module, ABC):
+    """A network that sees scenes and answers goals."""
+
+    heads: nn.ModuleDict
+    """What answers for each predicate, by its name. Made after all else, in the order that is
+    given, so that one more head leaves the first weights of the rest as they are."""
+
+    @abstractmethod
+    def encode(self, image: Tensor, views: Tensor, present: Tensor) -> Encoding:
+        """As `RelevanceModel.encode`, inputs float in 0..1."""
+
+    @abstractmethod
+    def decode(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
+        """As `RelevanceModel.decode`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BodyKind:
+    """What a body is registered as."""
+
+    config: type[ModelConfig]
+    """Its settings."""
+    make: Callable[[Any, Sequence[str]], Body]
+    """From settings and names of predicates to a network with fresh weights."""
+    version: str
+    """Raised when equal settings come to mean another network or another default."""
+
+
+BODIES: Registry[BodyKind] = Registry("body")
+"""Every body by name."""
+
+
+class RelevanceModel(nn.Module):
+    """Scores objects for goals; positive means relevant (DESIGN section 2: beta = 0)."""
+
+    def __init__(self, config: ModelConfig, predicates: Sequence[str] = tuple(PREDICATES)) -> None:
+        super().__init__()
+        self.config = config
+        self.predicates = tuple(predicates)
+        """Names of the predicates that it has a head for."""
+        self.body = BODIES[config.body].make(config, self.predicates)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are; every input is brought there."""
+        return next(self.parameters()).device
+
+    def encode(self, image: Tensor, views: Tensor, present: Tensor | None = None) -> Encoding:
+        """See a batch of scenes once, for all goals.
+
+        image (B, 3, H, W) and views (B, N, 3, 32, 32), uint8 or float in 0..1; present
+        (B, N) bool, default all. Raises ModelError for an image of another size.
+        """
+        camera = self.config.camera
+        if tuple(image.shape[-2:]) != (camera.height, camera.width):
+            raise ModelError(
+                f"image is {image.shape[-1]}x{image.shape[-2]}, "
+                f"expected {camera.width}x{camera.height}"
+            )
+        if present is None:
+            present = torch.ones(views.shape[:2], dtype=torch.bool)
+        device = self.device
+        return self.body.encode(
+            _unit(image.to(device)), _unit(views.to(device)), present.to(device)
+        )
+
+    def decode(self, encoding: Encoding, predicate: Predicate | str, goals: Tensor) -> Tensor:
+        """Scores (B, G, N), float32 logits, for goals (B, G, 2): subject and reference index.
+
+        Raises ModelError for a predicate that has no head here.
+        """
+        name = str(predicate)
+        if name not in self.predicates:
+            known = ", ".join(self.predicates)
+            raise ModelError(f"the model has no head for {name}, was trained on {known}")
+        goals = goals.to(encoding.tokens.device)
+        return self.body.decode(encoding, PREDICATES[name], goals).float()
+
+
+def model_config(values: Any) -> Any:
+    """The settings that `config_values` wrote, or an instance as it is; see `ModelConfig`.
+
+    Raises ConfigError for a setting that the body does not have, RelevanceError for a body that
+    is not there.
+    """
+    if isinstance(values, Mapping) and "body" in values:
+        return BODIES[values["body"]].config(**values)
+    return values
+
+
+def config_values(config: ModelConfig) -> dict[str, Any]:
+    """Plain numbers, strings and dicts; `model_config` gives an equal config back."""
+    return asdict(config)
+
+
+def _unit(x: Tensor) -> Tensor:
+    return x.float() / 255 if x.dtype == torch.uint8 else x

@@ -1,0 +1,147 @@
+"""How a model is trained: one config, its presets, and what of it names a checkpoint."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, field, replace
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BeforeValidator, Field
+
+from relevance.configs import config, execution, identity_hash
+from relevance.models import BODIES, ModelConfig, model_config
+from relevance.scene import Predicate
+
+TRAINER_VERSION = "1"
+"""Raised when equal settings on equal data come to mean other weights."""
+
+Count = Annotated[int, Field(ge=1)]
+Weight = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+Share = Annotated[float, Field(ge=0, lt=1)]
+Inner = Annotated[float, Field(gt=0, lt=1)]
+
+
+@config
+class TrainConfig:
+    """How a model is trained; raises ConfigError that names the field on impossible settings."""
+
+    preset: str = execution("custom")
+    """What the other settings start from; a word for people, in no identity."""
+    model: Annotated[ModelConfig, BeforeValidator(model_config)] = field(
+        default_factory=lambda: BODIES["glimpse"].config()
+    )
+    """The body and its settings."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Of the weights, the order of scenes and the augmentation."""
+    steps: Count = 1000
+    """Optimiser steps."""
+    scenes_per_batch: Count = 16
+    goals_per_scene: Count = 16
+    """Most goals of a scene and predicate in one batch."""
+    share_encodings: bool = True
+    """Consecutive turns of the same-plane predicates take the same scenes and one step."""
+    learning_rate: Positive = 8e-4
+    weight_decay: Weight = 0.02
+    betas: tuple[Share, Share] = (0.9, 0.98)
+    warmup: Share = 0.05
+    """Share of the steps over which the learning rate rises; then it falls as a cosine."""
+    clip: Positive = 1.0
+    """Largest norm of the gradient."""
+    eta_same_plane: Inner = 0.86
+    eta_on: Inner = 0.66
+    """Weight of the relevant objects in the loss (the paper's)."""
+    relevance_weight: Positive = 1.0
+    mask_weight: Weight = 0.3
+    """Weight of the loss on where each object is in the image (glimpse)."""
+    geometry_weight: Weight = 1.0
+    """Weight of the loss on position, size and footprint half-extents (glimpse)."""
+    mirror: bool = True
+    """Show half of the batches in a mirror."""
+    recolor: bool = True
+    """Exchange colour channels, image and views alike."""
+    policy: str = "found"
+    """The label policy to learn."""
+    ambiguous: bool = True
+    """Whether goals with a second moved set of the same length are learned from."""
+    bfloat16: Literal["auto", "on", "off"] = "auto"
+    """Autocast; auto: only on processors that multiply bfloat16 (others emulate it slowly)."""
+    device: str = execution("auto")
+    """Where: auto is the accelerator if there is one; else as torch names them, e.g. cuda:1."""
+    threads: Annotated[int, Field(ge=0)] = execution(0)
+    """CPU threads; 0 leaves torch's choice."""
+    save_every: Count = execution(50)
+    """Steps between saved states."""
+    cache_bytes: Annotated[int, Field(ge=0)] = execution(1_500_000_000)
+    """Decoded images up to this size stay in memory."""
+
+    @classmethod
+    def smoke(cls) -> Self:
+        """Seconds: every part runs, nothing is learned."""
+        model = BODIES["glimpse"].config.smoke()
+        return cls(preset="smoke", model=model, steps=8, scenes_per_batch=4, save_every=4)
+
+    @classmethod
+    def demo(cls) -> Self:
+        """About five minutes on two cores.
+
+        More steps on smaller batches learned more in the same time; exchanging colour channels
+        changed nothing in so short a run. One thread, since two wait for each other as soon as a
+        core is busy.
+        """
+        return cls(
+            preset="demo",
+            steps=2200,
+            scenes_per_batch=4,
+            goals_per_scene=3,
+            recolor=False,
+            threads=1,
+        )
+
+    @classmethod
+    def laptop(cls) -> Self:
+        """About an hour on two cores."""
+        return cls(preset="laptop", steps=20_000, scenes_per_batch=8)
+
+    @classmethod
+    def paper(cls) -> Self:
+        """The paper's ViT, loss weights and batch of 50; wants far more than a laptop."""
+        return cls(
+            preset="paper",
+            model=BODIES["vit"].config.paper(),
+            steps=500_000,
+            scenes_per_batch=50,
+            learning_rate=1e-5,
+            betas=(0.9, 0.999),
+            share_encodings=False,
+            mirror=False,
+            recolor=False,
+        )
+
+    def with_body(self, body: str) -> Self:
+        """The same with another body, of the sizes that it has for this preset."""
+        if body == self.model.body:
+            return self
+        kind = BODIES[body].config
+        sizes = {"smoke": kind.smoke, "paper": kind.paper}.get(self.preset, kind)
+        return replace(self, model=replace(sizes(), camera=self.model.camera))
+
+    def eta(self, predicate: Predicate) -> float:
+        """The loss weight of relevant objects for this predicate."""
+        return self.eta_on if predicate.stacked else self.eta_same_plane
+
+    @property
+    def content_hash(self) -> str:
+        """16 hex digits of what decides the weights: settings, trainer, body."""
+        body = self.model.body
+        return identity_hash(self, trainer=TRAINER_VERSION, body=f"{body} {BODIES[body].version}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values; `from_dict` gives an equal config back."""
+        return json.loads(json.dumps(asdict(self)))
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Read what `to_dict` wrote; raises RelevanceError on anything else."""
+        return cls(**values)
