@@ -313,7 +313,7 @@ def test_weights_and_settings_that_do_not_fit(tmp_path: Path) -> None:
         save_checkpoint(path, model, META | {"config": config})
         assert found in refused(path)
     with torch.no_grad():
-        next(model.parameters())[0] = torch.nan
+        next(model.parameters()).fill_(torch.nan)
     save_checkpoint(path, model, META)
     with pytest.raises(CheckpointError, match="is not finite, expected numbers"):
         load_checkpoint(path)

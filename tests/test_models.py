@@ -259,7 +259,7 @@ def test_glimpse_reads_its_geometry() -> None:
 @pytest.mark.parametrize(
     ("kind", "change", "message"),
     [
-        (VitConfig, {"width": 32}, "VitConfig: width is 32, expected a multiple of heads 6"),
+        (VitConfig, {"width": 30}, "VitConfig: width is 30, expected a multiple of heads 4"),
         (GlimpseConfig, {"layers": 0}, r"GlimpseConfig\.layers = 0: expected greater than"),
         (GlimpseConfig, {"body": "vit"}, r"GlimpseConfig\.body = 'vit': expected 'glimpse'"),
         (VitConfig, {"window": 30}, r"VitConfig\.window: unknown field"),

@@ -14,6 +14,7 @@ import torch
 from ruled import ruled
 
 from relevance import training
+from relevance.cli import main
 from relevance.metrics import accuracy
 from relevance.models import BODIES, RelevanceModel
 from relevance.models.glimpse import GlimpseConfig
@@ -406,3 +407,22 @@ def test_presets_survive_plain_values() -> None:
     paper = TrainConfig.from_dict(TrainConfig.paper().to_dict())
     assert paper.model == VitConfig.paper()
     assert TrainConfig.demo().content_hash != TrainConfig.smoke().content_hash
+
+
+def test_flags_are_those_of_the_body_that_is_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    for body, own, other in (
+        ("glimpse", "--model.window", "--model.hidden"),
+        ("vit", "--model.hidden", "--model.window"),
+    ):
+        with pytest.raises(SystemExit) as left:
+            main(["train", "--help", "--model.body", body])
+        shown = capsys.readouterr().out
+        assert left.value.code == 0
+        assert {"--model.body", "--model.width", own} <= set(shown.split())
+        assert other not in shown.split()
+    assert main(["train", "none", "--model.body", "cnn"]) == 2
+    assert "unknown body 'cnn', expected one of glimpse, vit" in capsys.readouterr().err
+    assert (
+        main(["train", "none", "--model.body", "vit", "--model.width", "64", "--steps", "1"]) == 2
+    )
+    assert "no dataset.json there" in capsys.readouterr().err

@@ -27,7 +27,7 @@ class VitConfig(ModelConfig):
     """The body that these settings are of."""
     width: Annotated[int, Field(ge=1)] = 192
     """D, width of all tokens."""
-    heads: Annotated[int, Field(ge=1)] = 6
+    heads: Annotated[int, Field(ge=1)] = 4
     """Attention heads; divides width."""
     layers: Annotated[int, Field(ge=1)] = 4
     """Transformer layers."""

@@ -144,4 +144,5 @@ class TrainConfig:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Read what `to_dict` wrote; raises RelevanceError on anything else."""
-        return cls(**values)
+        # The model first: what is wrong with it is said of its own class.
+        return cls(**{**values, "model": model_config(values.get("model", {}))})
