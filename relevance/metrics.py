@@ -1,6 +1,6 @@
 """Figures about scores and samples, each defined once: accuracy, intervals, bootstrap.
 
-An object is kept iff its score > -beta (DESIGN section 2), everywhere.
+An object is kept iff its score > -beta (CONTRIBUTING, The words), everywhere.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
--- What must hold between the rows of a dataset (DESIGN section 5). Each statement gives the
+-- What must hold between the rows of a dataset (data/README.md). Each statement gives the
 -- breaches of one rule as (file, "row", "column", message); `relevance check` runs them all over
 -- the table views with their columns file and "row".
 

@@ -37,7 +37,7 @@ from relevance.planner import plan
 from relevance.scene import Box, Camera, Goal, Scene
 from relevance.simulation import Renderer
 from relevance.store import Dataset
-from relevance.training import CheckpointError, load_checkpoint
+from relevance.training import CheckpointError, load_checkpoint, save_checkpoint
 
 BLOCKED = Scene(
     objects=(
@@ -339,8 +339,7 @@ def rewritten(checkpoint: Path, to: Path, **config) -> None:
     """A checkpoint with another id and other training settings."""
     model, meta = load_checkpoint(checkpoint)
     meta = meta | {"checkpoint_id": "glimpse-foreign", "config": meta["config"] | config}
-    content = {"version": 1, "kind": "checkpoint", "meta": meta, "model": model.state_dict()}
-    torch.save(content, to)
+    save_checkpoint(to, model, meta)
 
 
 def test_predictions_are_judged_by_the_policy_that_the_checkpoint_learned(tmp_path) -> None:

@@ -28,7 +28,7 @@ from relevance.scene import Box, Goal, Scene
 CLEARANCE = 0.003
 """What a placed box and the hand (its meshes in boxes, 1 mm wider) keep from everything, m."""
 WIDEST = 0.07
-"""Widest edge that the hand takes (DESIGN section 2), m."""
+"""Widest edge that the hand takes (CONTRIBUTING, The words), m."""
 SPREAD = 0.003
 """How far each finger stands off the box before it closes, m."""
 OFFSET = 0.005

@@ -41,7 +41,7 @@ _STREAM = "bench"  # a split of its own: never a scene of a dataset
 EDGES = (0.04, 0.12)
 """Shortest and longest edge of a foreign box, m."""
 TAKEN = 0.07
-"""Longest shorter edge of a foreign subject, m: DESIGN section 2 calls others obstacles."""
+"""Longest shorter edge of a foreign subject, m: others are obstacles (CONTRIBUTING, The words)."""
 WITHIN = (0.30, 0.72)
 """Distance of a foreign box from the robot's base, m."""
 APART = 0.001

@@ -1,6 +1,6 @@
 """What a checkpoint is worth: its accuracy, and the planner rerun with and without it.
 
-beta (DESIGN section 2): an object is kept iff score > -beta; goal objects are always kept.
+beta (CONTRIBUTING, The words): an object is kept iff score > -beta; goal objects are always kept.
 """
 
 from relevance.evaluation.comparisons import (

@@ -257,8 +257,7 @@ def compare(
         for repeat in range(config.repeats):
             for position in range(len(runs)):
                 which = runs[(position + turn + repeat) % len(runs)]
-                mode: Any = which and which[0]
-                guide = which and Guide(scorer=scorer, mode=mode, beta=which[1])
+                guide = which and Guide(scorer=scorer, mode=which[0], beta=which[1])
                 timed[which].append(_timed(scene, goal, planner, guide))
         unguided = timed.pop(None)
         for which in runs[1:]:

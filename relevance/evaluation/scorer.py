@@ -19,7 +19,7 @@ import numpy as np
 from relevance.errors import RelevanceError, RelevanceWarning
 from relevance.planner import Guide
 from relevance.sampling import Randomisation
-from relevance.scene import Box, Camera, Goal, Scene
+from relevance.scene import Camera, Goal, Scene, lookalikes
 from relevance.store import Dataset
 
 if TYPE_CHECKING:  # models imports torch, which the planner and the report do without
@@ -173,20 +173,6 @@ def _pose(camera: Camera) -> str:
     return f"eye {eye}; target {target}; fov {camera.fov:g}"
 
 
-def lookalikes(scene: Scene) -> list[tuple[str, ...]]:
-    """Names of boxes of equal size and colour, which equal views stand for."""
-    groups: dict[tuple[Any, ...], list[str]] = {}
-    for box in scene.objects:
-        groups.setdefault(_looks(box), []).append(box.name)
-    return [tuple(names) for names in groups.values() if len(names) > 1]
-
-
-def _looks(box: Box) -> tuple[Any, ...]:
-    """Size to 1 mm, footprint edges in any order, and colour to one of 255 steps."""
-    x, y, z = (round(1000 * edge) for edge in box.size)
-    return min(x, y), max(x, y), z, tuple(round(255 * channel) for channel in box.color)
-
-
 def warn(message: str) -> None:
     """A RelevanceWarning, shown once for each message."""
     warnings.warn(message, RelevanceWarning, stacklevel=2)
@@ -235,5 +221,4 @@ def load_guide(
     """A guide for `plan` from a checkpoint file; EvaluationError unless beta is finite."""
     if not math.isfinite(beta):
         raise EvaluationError(f"beta: {beta}, expected a finite number")
-    chosen: Any = mode  # the planner checks the name
-    return Guide(scorer=load_scorer(checkpoint), mode=chosen, beta=beta)
+    return Guide(scorer=load_scorer(checkpoint), mode=mode, beta=beta)

@@ -54,7 +54,7 @@ BODIES: Registry[BodyKind] = Registry("body")
 
 
 class RelevanceModel(nn.Module):
-    """Scores objects for goals; positive means relevant (DESIGN section 2: beta = 0)."""
+    """Scores objects for goals; positive means relevant (CONTRIBUTING, The words)."""
 
     def __init__(self, config: ModelConfig, predicates: Sequence[str] = tuple(PREDICATES)) -> None:
         super().__init__()

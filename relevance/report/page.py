@@ -103,6 +103,7 @@ def _page(dataset: Dataset, checkpoint_id: str | None, examples: int) -> dict[st
         "name": dataset.path.resolve().name,
         "made": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "dataset_hash": dataset.content_hash(),
+        "training_hash": dataset.content_hash(policy=policy, split="train") if chosen else None,
         "data": data,
         "planner": planner,
         "model": model,

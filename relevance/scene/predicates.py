@@ -22,7 +22,7 @@ from relevance.scene.checks import SceneError, checked
 from relevance.scene.words import normal, shown
 
 GAP = 0.05
-"""Depth of a same-plane goal region, m (DESIGN section 2)."""
+"""Depth of a same-plane goal region, m (CONTRIBUTING, The words)."""
 
 
 @plain_dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +86,7 @@ class Predicate(ABC):
 
 @plain_dataclass(frozen=True, slots=True, kw_only=True)
 class Beside(Predicate):
-    """On the table, in a region GAP deep on one side of the reference (DESIGN section 2)."""
+    """On the table, in a region GAP deep on one side of the reference (CONTRIBUTING, The words)."""
 
     toward: tuple[float, float]
     """Unit vector (x, y) in the robot's axes from reference to subject."""
@@ -183,7 +183,7 @@ class Goal:
 
 
 def goal_holds(objects: Iterable[Box], goal: Goal, robot: Robot, tolerance: float = 1e-3) -> bool:
-    """Whether the goal is true of these boxes (DESIGN section 2), up to `tolerance` metres."""
+    """Whether the goal is true of these boxes, up to `tolerance` metres."""
     boxes = {box.name: box for box in objects}
     subject, reference = boxes[goal.subject], boxes[goal.reference]
     return goal.predicate.holds(subject, reference, robot, tolerance)

@@ -39,7 +39,7 @@ def relevance_loss(scores: Tensor, relevant: Tensor, mask: Tensor, eta: float) -
     """-mean(eta z log p + (1 - eta) (1 - z) log(1 - p)) over `mask`, p = sigmoid(score).
 
     All of one shape; z = relevant in 0..1. The paper's formula read literally would give the
-    rarer class the smaller weight; here the relevant objects weigh eta (DESIGN section 2).
+    rarer class the smaller weight; here the relevant objects weigh eta (CONTRIBUTING, The words).
     Zero when the mask is empty.
     """
     z = relevant.to(scores.dtype)
