@@ -11,6 +11,7 @@ import json
 import os
 import socket
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -302,6 +303,10 @@ def resumed(root: str | Path) -> Dataset:
     """Open a dataset; a change-over that was cut short is done to its end first."""
     root = locate(root)
     file = root / "dataset.json"
-    if file.is_file() and '"changing"' in (text := file.read_text(encoding="utf-8")):
-        change_over(Dataset(root, json.loads(text)))
+    if file.is_file():
+        said = None
+        with suppress(ValueError):  # named by `Dataset.open`
+            said = json.loads(file.read_text(encoding="utf-8"))
+        if isinstance(said, dict) and said.get("changing"):
+            change_over(Dataset(root, said))
     return Dataset.open(root)
