@@ -1,6 +1,7 @@
 # make demo    install, run the whole pipeline on a small dataset, say where the report is
 # make test    install with the test tools, run the default tests
 # make check   formatting, lint, types, and the order of imports
+# make drawing write the drawing of the rooms and the map of the files into CONTRIBUTING.md
 # make deploy  register the flows with a running Prefect server
 
 PYTHON ?= python3
@@ -15,7 +16,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # --no-compile: byte code is made when a module is first used, which saves a minute here.
 
-.PHONY: demo test test-slow check format deploy clean
+.PHONY: demo test test-slow check format drawing deploy clean
 .DELETE_ON_ERROR:
 
 # What the demo tells Prefect stays in this folder. Killed or done, it may be run again: finished
@@ -40,6 +41,9 @@ check: .venv/installed-dev
 format: .venv/installed-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+drawing: .venv/installed-dev
+	$(BIN)/python tests/structure.py
 
 deploy: .venv/installed
 	$(BIN)/prefect work-pool inspect relevance >/dev/null 2>&1 \

@@ -146,5 +146,25 @@ def drawing(root: Path = ROOT) -> str:
     return "\n".join(lines)
 
 
+def house(root: Path = ROOT) -> str:
+    """Every file of the product by room, from the ground up, with what its docstring says first."""
+    place = {room: i for i, room in enumerate((*ORDER, "relevance", "flows", "dashboards"))}
+    lines: list[str] = []
+    for file in sorted(sources(root), key=lambda file: place[room_of(module_of(file, root))]):
+        docstring = ast.get_docstring(ast.parse(file.read_text())) or ""
+        lines.append(f"- `{file.relative_to(root)}`: {docstring.splitlines()[0]}")
+    return "\n".join(lines)
+
+
+def rewrite(text: str) -> str:
+    """CONTRIBUTING.md with today's drawing and map between their marks."""
+    for name, body in (("drawing", f"```mermaid\n{drawing()}\n```"), ("map", house())):
+        start, end = f"<!-- {name} -->\n", f"<!-- end of the {name} -->"
+        head, _, rest = text.partition(start)
+        text = f"{head}{start}{body}\n{end}{rest.partition(end)[2]}"
+    return text
+
+
 if __name__ == "__main__":
-    print(drawing())
+    file = ROOT / "CONTRIBUTING.md"
+    file.write_text(rewrite(file.read_text()))

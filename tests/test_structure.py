@@ -15,6 +15,7 @@ from structure import (
     files_imported,
     imports,
     module_of,
+    rewrite,
     room_of,
     sources,
 )
@@ -112,9 +113,11 @@ def test_circles_are_seen_within_a_room_and_inside_functions(tmp_path: Path) -> 
     assert {*found} == {f"relevance.store.{name}" for name in "abc"}
 
 
-def test_the_drawing_is_of_this_house() -> None:
-    """Made by `make drawing`."""
-    assert drawing() in (ROOT / "CONTRIBUTING.md").read_text()
+def test_drawing_and_map_are_of_this_house() -> None:
+    """`make drawing` writes them anew."""
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    assert rewrite(text) == text
+    assert drawing() in text
 
 
 def test_importing_the_package_is_light() -> None:
