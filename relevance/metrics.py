@@ -134,6 +134,10 @@ class Interval:
     high: float
     n: int
 
+    def __format__(self, spec: str) -> str:
+        """`12.3 (11.0 to 13.9)`, each number by `spec`."""
+        return f"{self.value:{spec}} ({self.low:{spec}} to {self.high:{spec}})"
+
 
 def mean_interval(values: Iterable[float], *, confidence: float = CONFIDENCE) -> Interval:
     """Mean with its bootstrap interval; same values, same interval."""

@@ -8,16 +8,16 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap
+from scipy.stats import binomtest
 
 from relevance.benchmarks.tasks import Task
+from relevance.metrics import Interval, bootstrap
 from relevance.planner import PlannerConfig, PlanResult, plan
 from relevance.report.tables import Table
 
 # -- figures: one place knows how an interval is made ----------------------------------------------
 
 CONFIDENCE = 0.95
-RESAMPLES = 2000
 STATISTICS: Mapping[str, Callable[..., Any]] = {
     "median": np.median,
     "mean": np.mean,
@@ -26,58 +26,21 @@ STATISTICS: Mapping[str, Callable[..., Any]] = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Interval:
-    """A figure and the ends of its 95% interval."""
-
-    value: float
-    low: float
-    high: float
-
-    def __format__(self, spec: str) -> str:
-        """`12.3 (11.0 to 13.9)`, each number by `spec`."""
-        return f"{self.value:{spec}} ({self.low:{spec}} to {self.high:{spec}})"
-
-
 def interval(values: Sequence[float] | np.ndarray, statistic: str) -> Interval:
-    """A statistic of a sample (N,) with its bootstrap interval; NaN throughout when empty."""
-    sample, compute = np.asarray(values, dtype=float), STATISTICS[statistic]
-    if len(sample) == 0:
-        return Interval(value=np.nan, low=np.nan, high=np.nan)
-    value = float(compute(sample))
-    if len(sample) == 1 or (sample == sample[0]).all():
-        return Interval(value=value, low=value, high=value)
-    return _resampled((sample,), compute, value)
+    """A statistic of a sample (N,) with its 95% interval; NaN throughout when empty."""
+    sample = np.asarray(values, dtype=float)
+    return bootstrap((sample,), STATISTICS[statistic], confidence=CONFIDENCE)
 
 
 def ratio(a: Sequence[float], b: Sequence[float], statistic: str) -> Interval:
-    """A statistic of `a` over that of `b`, the same tasks, with its paired bootstrap interval."""
+    """A statistic of `a` over that of `b`, the same tasks, with its paired 95% interval."""
     one = STATISTICS[statistic]
 
     def compute(x: np.ndarray, y: np.ndarray, axis: int = -1) -> Any:
         return one(x, axis=axis) / one(y, axis=axis)
 
-    x, y = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    value = float(compute(x, y))
-    if len(x) < 2:
-        return Interval(value=value, low=np.nan, high=np.nan)
-    return _resampled((x, y), compute, value)
-
-
-def _resampled(samples: tuple[np.ndarray, ...], compute: Any, value: float) -> Interval:
-    """The bootstrap interval of a statistic; several samples are resampled as pairs."""
-    found = bootstrap(
-        samples,
-        compute,
-        paired=len(samples) > 1,
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        batch=200,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return Interval(value=value, low=float(found.low), high=float(found.high))
+    samples = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    return bootstrap(samples, compute, confidence=CONFIDENCE)
 
 
 def share(part: int, whole: int) -> str:

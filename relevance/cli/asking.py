@@ -13,17 +13,18 @@ from relevance.cli.terminal import Format, bar, console, say, show, to_json
 
 
 def _check(_: Preset) -> Callable[..., int]:
-    def check(dataset: DatasetArg, render: bool = True) -> int:
+    def check(dataset: DatasetArg, render: bool = True, strict: bool = False) -> int:
         """Check every contract of a dataset; exit code 1 and a line for each breach.
 
         Args:
             dataset: Folder of the dataset.
             render: Also render one scene of each shard again and compare the pixels.
+            strict: Also name the files whose table had fewer columns when they were written.
         """
         from relevance.pipeline.checking import check
 
         with bar("files") as progress:
-            breaches = check(dataset, render=render, progress=progress)
+            breaches = check(dataset, render=render, strict=strict, progress=progress)
         for breach in breaches:
             print(breach)
         say(
