@@ -27,7 +27,7 @@ from relevance.scene import (
     read_scenes,
 )
 from relevance.scene.contacts import robot_depth
-from relevance.simulation import panda_urdf
+from relevance.robot import panda_urdf
 
 CASES = Path(__file__).parent / "cases"
 

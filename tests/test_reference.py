@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from relevance.planner.kinematics import reach_interval
+from relevance.planner.kernels.kinematics import reach_interval
 
 from relevance.benchmarks import draw
 from relevance.benchmarks.reference import (
