@@ -156,7 +156,7 @@ def _gaps(
     best = np.full(len(poses), np.inf)
     angle = poses[:, 2] + grasp.axis * math.pi / 2
     axes = np.stack([np.cos(angle), np.sin(angle)], axis=-1)  # (N, 2), the finger axis
-    for i, (offset, along, across, under) in enumerate(grasp.parts):
+    for i, (offset, _, along, across, under) in enumerate(grasp.parts):
         if i == 0 and hand_only:
             continue
         centre = poses[:, :2] + offset * axes

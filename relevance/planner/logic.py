@@ -8,14 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from relevance.scene import Action, Goal, Scene
+from relevance.scene import Action, Box, Goal, Scene
 
 
 def stacked_on(scene: Scene) -> dict[str, frozenset[str]]:
     """For each object, the objects that stand directly on it."""
     return {
-        name: frozenset(box.name for box in scene.objects if box.on == name) for name in scene.names
+        name: frozenset(box.name for box in scene.objects if name in supports(box))
+        for name in scene.names
     }
+
+
+def supports(box: Box) -> tuple[str, ...]:
+    """The boxes that a box stands on; none for the table."""
+    if box.on is None:
+        return ()
+    return (box.on,) if isinstance(box.on, str) else tuple(box.on)
 
 
 def actions(goal: Goal, order: Sequence[str]) -> tuple[Action, ...]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from relevance.planner.grasps import bodies, carried, pick_target
+from relevance.planner.grasps import bodies, carried, hand_target, pick_target, upper_bodies
 from relevance.planner.kernels.boxes import (
     banded_solve,
     body_pose,
@@ -26,7 +26,13 @@ from relevance.planner.kernels.boxes import (
     separation,
     upright,
 )
-from relevance.planner.kernels.kinematics import FRAME, finger_turn, look_at_frames, look_at_grasp
+from relevance.planner.kernels.kinematics import (
+    FRAME,
+    finger_turn,
+    finger_way,
+    look_at_frames,
+    look_at_grasp,
+)
 from relevance.planner.logic import actions
 from relevance.planner.pose import Placement
 from relevance.planner.problem import Problem
@@ -69,7 +75,7 @@ class Motion:
     phases: tuple[Phase, ...]
     final: dict[str, Pose]
     cost: float
-    """Squared joint accelerations, summed over rows, rad^2."""
+    """Squared joint accelerations, summed over rows, and the prices of the holds, rad^2."""
     max_penetration: float
     """Deepest penetration at the sub-steps of the dense check, m."""
 
@@ -79,6 +85,30 @@ class PathBound:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
+
+    def _motion(
+        self,
+        X: np.ndarray,
+        leave: np.ndarray,
+        leaving: bool,
+        arrive: np.ndarray,
+        opening: float,
+        held: tuple[np.ndarray, np.ndarray] | None,
+        obstacles: np.ndarray,
+    ) -> tuple[float, float, float]:
+        """`motion`; among tall things once more with every link, where it brings one too near."""
+        problem = self.problem
+        found = motion(X, problem.arm, leave, leaving, arrive, bodies(opening, held), obstacles)
+        tall = obstacles[: len(problem.boxes) - (held is not None)]
+        if found[0] < 0 or not problem.tall or not len(tall):
+            return found
+        upper = upper_bodies()
+        margin, broken = np.zeros((len(upper.link), len(tall))), np.zeros((len(X) - 1, 2))
+        if dense_check(X, problem.whole_arm, upper, tall, margin, broken) <= ALLOWED:
+            return found
+        # The foot is under the links near the base: they are not asked to keep clear of it.
+        every = bodies(opening, held, upper=True)
+        return motion(X, problem.whole_arm, leave, leaving, arrive, every, obstacles[:-1])
 
     def solve(
         self,
@@ -117,21 +147,22 @@ class PathBound:
                 bottom = obstacles[problem.index[on], 2] + obstacles[problem.index[on], 6]
             take = pick_target(box, grasp)
             z = bottom + box.size[2] / 2 + grasp.above
-            put = np.array([poses[j, 0], poses[j, 1], z, poses[j, 2]])
-            free = bodies(grasp.opening)
-            held = bodies(grasp.closed, carried(box, grasp))
-            for k, (arrive, body, opening) in enumerate(
-                ((take, free, grasp.opening), (put, held, grasp.closed))
+            put = hand_target(poses[j, 0], poses[j, 1], z, poses[j, 2], grasp.shift)
+            in_hand = carried(box, grasp, finger_way(arm, q[2 * j], take[3]))
+            for k, (arrive, hold, opening) in enumerate(
+                ((take, None, grasp.opening), (put, in_hand, grasp.closed))
             ):
                 problem.counts.path += 1
                 there[i] = k == 0
                 X = np.empty((ROWS + 1, ARM))
                 X[0], X[-1] = at, q[2 * j + k]
-                depth, effort, dt = motion(X, arm, leave, leaving, arrive, body, obstacles[there])
+                depth, effort, dt = self._motion(
+                    X, leave, leaving, arrive, opening, hold, obstacles[there]
+                )
                 if depth < 0:
                     return None
-                action, in_hand = sequence[2 * j + k], name if k else None
-                phases.append(Phase(action=action, q=X, dt=dt, opening=opening, carried=in_hand))
+                action, held = sequence[2 * j + k], name if k else None
+                phases.append(Phase(action=action, q=X, dt=dt, opening=opening, carried=held))
                 cost, worst = cost + effort, max(worst, depth)
                 at, leave, leaving = X[-1], arrive, True
             there[i] = True
@@ -142,11 +173,12 @@ class PathBound:
             final[name] = Pose(position=position, yaw=yaw, on=on)
             X = np.empty((2 * VERTICAL + 1, ARM))
             X[0] = at
+            free = bodies(grasp.opening)
             depth, effort, dt = retreat(X, arm, put, free, obstacles[there])
             if not 0 <= depth <= ALLOWED:
                 return None
             phases.append(Phase(action=None, q=X, dt=dt, opening=grasp.opening, carried=None))
-            cost, worst = cost + effort, max(worst, depth)
+            cost, worst = cost + effort + grasp.price, max(worst, depth)
             at, leaving = X[-1], False
         return Motion(
             order=order, phases=tuple(phases), final=final, cost=cost, max_penetration=worst
