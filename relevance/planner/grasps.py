@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 
@@ -139,18 +139,26 @@ def carried(box: Box, grasp: Grasp, way: float = 1.0) -> tuple[np.ndarray, np.nd
 def bodies(opening: float, carried: tuple | None = None, *, upper: bool = False) -> Bodies:
     """Arm, hand and fingers at this opening; last the carried box (centre, half), if any.
 
-    upper: with the links near the base too.
+    upper: with the links near the base too. Not to be written to: it is kept.
     """
+    if carried is None:
+        return _bodies_of(opening, None, None, upper)
+    return _bodies_of(opening, *(tuple(vector.tolist()) for vector in carried), upper)
+
+
+@lru_cache(maxsize=256)
+def _bodies_of(opening: float, centre: tuple | None, half: tuple | None, upper: bool) -> Bodies:
     shut, sides = _shut_hand(upper)
-    count = len(sides) - (carried is None)
-    link, centre, half, radius = (rows[:count].copy() for rows in shut)
-    centre[:, 1] += opening * sides[:count]
-    if carried is not None:
-        centre[-1], half[-1] = carried
-        radius[-1] = math.hypot(*half[-1])
-    return Bodies(link, centre, half, radius)
+    count = len(sides) - (centre is None)
+    link, centres, halves, radius = (rows[:count].copy() for rows in shut)
+    centres[:, 1] += opening * sides[:count]
+    if half is not None:
+        centres[-1], halves[-1] = centre, half
+        radius[-1] = math.hypot(*half)
+    return Bodies(link, centres, halves, radius)
 
 
+@cache
 def upper_bodies() -> Bodies:
     """The links near the base alone."""
     return _bodies(list(panda().upper_arm))

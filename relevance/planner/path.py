@@ -33,6 +33,7 @@ from relevance.planner.kernels.kinematics import (
     look_at_frames,
     look_at_grasp,
 )
+from relevance.planner.kernels.rows import WIDTH, acceleration_cost, smoothness, time_step
 from relevance.planner.logic import actions
 from relevance.planner.pose import Placement
 from relevance.planner.problem import Problem
@@ -45,10 +46,6 @@ VERTICAL = 3
 """Rows beside a switch at which the hand is straight over it."""
 RISE = 0.06
 """Height of the vertical parts, m."""
-STEP = 0.1
-"""Shortest time between rows, s."""
-SPEED = 0.9
-"""Share of the velocity limits that motions use."""
 CLEARANCE = 0.002
 """Clearance asked for along the way, m; less where a switch itself leaves less."""
 SUBSTEPS = 8
@@ -63,7 +60,6 @@ ROUGH_STEP = 1e-2
 """The same before the multipliers are set for the first time, rad."""
 TOLERANCE = 4e-4
 """Largest violation of a solved problem, m or rad."""
-_WIDTH = 3 * ARM
 _EXCHANGES = 4
 
 
@@ -238,24 +234,6 @@ def distances(arm, q, bodies, obstacles, out):
 
 
 @njit(cache=True)
-def smoothness(T):
-    """Second derivative of half the squared accelerations, (n, 3 * ARM) as for `banded_solve`."""
-    band = np.zeros(((T - 1) * ARM, _WIDTH))
-    for t in range(T + 1):
-        for i in range(ARM):
-            for u in range(-1, 2):
-                for v in range(-1, u + 1):
-                    row, column = t + u, t + v
-                    if column < 1 or row > T - 1:
-                        continue
-                    product = (-2.0 if u == 0 else 1.0) * (-2.0 if v == 0 else 1.0)
-                    band[(column - 1) * ARM + i, (row - column) * ARM] += product
-    for i in range(len(band)):
-        band[i, 0] += 1e-6
-    return band
-
-
-@njit(cache=True)
 def assemble(
     X, arm, bodies, obstacles, margin, samples, targets, smooth, eq, ineq, limit, mu, gain, band,
     g,
@@ -355,7 +333,7 @@ def solve(X, arm, bodies, obstacles, margin, samples, targets):
     """
     T = len(X) - 1
     n = (T - 1) * ARM
-    smooth, band, g = smoothness(T), np.zeros((n, _WIDTH)), np.zeros(n)
+    smooth, band, g = smoothness(T), np.zeros((n, WIDTH)), np.zeros(n)
     eq, limit = np.zeros((T + 1, 6)), np.zeros((T + 1, ARM, 2))
     ineq = np.zeros((len(samples), len(bodies.link), len(obstacles)))
     old, step = X.copy(), np.zeros(n)
@@ -592,24 +570,3 @@ def retreat(X, arm, leave, bodies, obstacles) -> tuple[float, float, float]:
     margin = np.zeros((len(bodies.link), len(obstacles)))
     depth = dense_check(X, arm, bodies, obstacles, margin, np.zeros((steps, 2)))
     return depth, acceleration_cost(X), time_step(arm, X)
-
-
-@njit(cache=True)
-def time_step(arm, X):
-    """Seconds between rows such that no joint exceeds its share of the velocity limit."""
-    slowest = STEP
-    for t in range(len(X) - 1):
-        for i in range(ARM):
-            slowest = max(slowest, abs(X[t + 1, i] - X[t, i]) / arm.velocity[i] / SPEED)
-    return slowest
-
-
-@njit(cache=True)
-def acceleration_cost(X):
-    """Sum of squared second differences of the rows, at rest before and after, rad^2."""
-    total, T = 0.0, len(X) - 1
-    for t in range(T + 1):
-        for i in range(ARM):
-            a = X[max(t - 1, 0), i] - 2 * X[t, i] + X[min(t + 1, T), i]
-            total += a * a
-    return total

@@ -155,6 +155,18 @@ class PoseBound:
                 found = self._place_blockers(order, kept, reference)
                 if found is not None:
                     yield [*found, place]
+                    if place.grasp.shift:
+                        yield from ([*found, twin] for twin in self._twins(gone, place))
+
+    def _twins(self, gone: frozenset[str], place: Placement) -> Iterator[Placement]:
+        """The subject taken on its other side and put down half a turn further: the hand ends at
+        the same place, but the other way round."""
+        x, y, angle = place.pose
+        grasp = place.grasp
+        for other in self._others(self.problem.goal.subject, gone):
+            same = other.axis == grasp.axis and other.depth == grasp.depth
+            if same and other.shift == -grasp.shift:
+                yield Placement(grasp=other, pose=(x, y, angle + math.pi))
 
     def interval(self, bottom: float, box: Box, grasp: Grasp) -> tuple[float, float]:
         """Reach (near, far) for holding the box with its underside at this height, liftably, m."""
@@ -213,7 +225,13 @@ class PoseBound:
         began, problem = time.process_time(), self.problem
         problem.counts.pose += 1
         shallow = list({grasp.shift: grasp for grasp in choice}.values())
-        ways = [(grasp, turn) for grasp in shallow for turn in ((0, 1) if grasp.shift else (0,))]
+        # Shifted to one side, or to the other and turned: the hand is at the same place.
+        sides = {
+            -grasp.shift if turn else grasp.shift: (grasp, turn)
+            for turn in (1, 0)
+            for grasp in shallow
+        }
+        ways = sorted(sides.values(), key=lambda way: way[0].price)
         pose, prefer = np.zeros(4), np.array(prefer)
         table, at = problem.table, problem.arm.base
 

@@ -48,6 +48,8 @@ class Problem:
     """(2,) half extents, m."""
     obstacles: np.ndarray = field(init=False)
     """(N + 2, UPRIGHT): the boxes as they stand at first, then the table and the robot's foot."""
+    tall: bool = field(init=False)
+    """Whether a box is so high that it could meet the links near the base."""
     arm: Arm = field(init=False)
     whole_arm: Arm = field(init=False)
     """The same with the links near the base."""
@@ -61,13 +63,9 @@ class Problem:
         standing = [obstacle(box) for box in self.scene.objects]
         self._unsink(np.array(standing), standing)
         self.obstacles = np.array([*standing, *self._fixtures()])
+        tops = [box.top for box in self.scene.objects]
+        self.tall = max(tops) - self.scene.robot.base[2] > LOW
         self.above = logic.stacked_on(self.scene)
-
-    @property
-    def tall(self) -> bool:
-        """Whether a box is so high that it could meet the links near the base."""
-        tops = self.obstacles[: len(self.boxes), 2] + self.obstacles[: len(self.boxes), 6]
-        return bool(tops.max() - self.arm.base[2] > LOW)
 
     @property
     def subject(self) -> Box:
@@ -84,9 +82,8 @@ class Problem:
         that they only touch."""
         apart = np.hypot(*(rows[:, None, :2] - rows[None, :, :2]).transpose(2, 0, 1))
         beside = apart < rows[:, None, 7] + rows[None, :, 7]
-        beside &= (
-            np.abs(rows[:, None, 2] - rows[None, :, 2]) < (rows[:, None, 6] + rows[:, 6]) - 1e-3
-        )
+        heights = rows[:, None, 6] + rows[None, :, 6] - 1e-3  # what stands on another is not beside
+        beside &= np.abs(rows[:, None, 2] - rows[None, :, 2]) < heights
         for i, k in zip(*np.nonzero(np.triu(beside, 1)), strict=True):
             sunk = -footprint_gap(self.scene.objects[i], self.scene.objects[k])
             for row in (standing[i], standing[k]) if sunk > 0 else ():

@@ -378,29 +378,39 @@ class _Search:
         """Breadth-first over sets of objects moved before the subject, grown by what could help."""
         subject, near = self.problem.goal.subject, self._beside_goal()
         rank = {name: i for i, name in enumerate(movable) if name != subject}
-        frontier: list[frozenset[str]] = [frozenset()]
+        frontier, rest = [frozenset[str]()], list[frozenset[str]]()
         for _ in range(self.config.max_actions // 2):
-            found, following = [], set()
-            for chosen in frontier:
+            found, following, others = [], set(), set()
+            for chosen in self._tiers(frontier, rest, found):
                 self._visit()
-                helpful = frozenset[str]()
+                self.late = False
                 if required <= chosen:
-                    self.late = False
                     motion = self._finish(chosen, self._orders(chosen))
                     if motion is not None:
                         found.append(motion)
                         if self.config.stop == "first":
                             return found
-                    if self.late:  # the others' leaving can make room for what is put aside
-                        helpful = frozenset(rank)
-                if not helpful:
-                    helpful = near | self._in_the_way(chosen)
+                helpful = near | self._in_the_way(chosen)
                 following |= {chosen | {name} for name in helpful - chosen if name in rank}
+                if self.late:  # the others' leaving can make room for what is put aside
+                    others |= {chosen | {name} for name in rank if name not in chosen}
             if found:
                 return found
-            frontier = sorted(following, key=lambda names: sorted(rank[name] for name in names))
-        self.cut |= bool(frontier)
+
+            def key(names: frozenset[str]) -> list[int]:
+                return sorted(rank[name] for name in names)
+
+            frontier, rest = sorted(following, key=key), sorted(others - following, key=key)
+        self.cut |= bool(frontier or rest)
         return []
+
+    def _tiers(
+        self, first: list[frozenset[str]], rest: list[frozenset[str]], found: list[Motion]
+    ) -> Iterator[frozenset[str]]:
+        """The likely sets of a level, and the rest where none of them has given a plan."""
+        yield from first
+        if not found:
+            yield from rest
 
     def _beside_goal(self) -> frozenset[str]:
         """Objects whose leaving can make room in the goal region; and the reference."""

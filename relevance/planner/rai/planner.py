@@ -35,7 +35,7 @@ from pydantic import Field
 from relevance.configs import config
 from relevance.errors import RelevanceError
 from relevance.planner.guides import Guide, ask, rounds
-from relevance.planner.path import SPEED, STEP
+from relevance.planner.kernels.rows import SPEED, STEP
 from relevance.planner.result import (
     Counts,
     PlanResult,
