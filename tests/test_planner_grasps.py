@@ -9,7 +9,7 @@ import pytest
 
 from relevance.planner import PlannerConfig, plan, trajectory
 from relevance.planner.checking import broken
-from relevance.planner.grasps import FARTHEST, GRIP, GROUND, INSET, grasps, variants
+from relevance.planner.grasps import FARTHEST, GRIP, GROUND, INSET, grasps, other_grasps
 from relevance.planner.path import Motion
 from relevance.planner.problem import Problem
 from relevance.scene import Scene, scene_from_json
@@ -69,14 +69,14 @@ def test_every_hold_is_sound():
     for _ in range(200):
         size = tuple(rng.uniform(0.008, 0.12, 3))
         one = box("b", 0.0, 0.0, size=size)
-        for deep in grasps(one):
-            for grasp in (deep, *variants(one, deep)):
-                count += 1
-                assert GRIP <= grasp.depth <= size[2] - GROUND + 1e-9
-                assert abs(grasp.shift) <= max(size[1 - grasp.axis] / 2 - INSET, 0.0) + 1e-9
-                assert abs(grasp.shift) <= FARTHEST
-                assert grasp.price >= 0
-                assert (grasp.price == 0) == (grasp is deep)
+        deep = grasps(one)
+        for grasp in (*deep, *other_grasps(one).grasps):
+            count += 1
+            assert GRIP <= grasp.depth <= size[2] - GROUND + 1e-9
+            assert abs(grasp.shift) <= max(size[1 - grasp.axis] / 2 - INSET, 0.0) + 1e-9
+            assert abs(grasp.shift) <= FARTHEST
+            assert grasp.price >= 0
+            assert (grasp.price == 0) == (grasp in deep)
     assert count > 1000
 
 
@@ -155,3 +155,20 @@ def test_a_trajectory_is_the_plan():
     moves = np.abs(np.diff(arrays["joints"], axis=0)).max(axis=1)
     assert moves[np.diff(arrays["gripper"]) != 0].max() == 0  # still while the fingers move
     assert len(trajectory(replace(result, phases=()))["times"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("base", "yaw"),
+    [((-0.48, 0.0, 0.0), 0.4), ((0.0, -0.6, 0.0), math.pi / 2), ((0.55, 0.0, 0.0), math.pi),
+     ((-0.48, 0.0, 0.1), 0.0)],
+)  # fmt: skip
+def test_robots_stand_anywhere(base, yaw):
+    wall = box("grey", 0.0, -0.02, GREY, size=(0.12, 0.06, 0.08))
+    red, blue = box("red", 0.05, 0.15, RED), box("blue", 0.0, -0.12, BLUE)
+    robot = replace(OPEN.robot, base=base, yaw=yaw)
+    scene = Scene(objects=(red, blue, wall), robot=robot)
+    for goal in ("on(red, blue)", "in-front(red, blue)"):
+        result = plan(scene, goal)
+        assert result.status == "solved", result.reason
+        assert result.replay is not None
+        assert result.replay.ok

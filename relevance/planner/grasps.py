@@ -12,9 +12,9 @@ is preferred: what a hold lacks of that is a price in the plan's cost.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,22 +62,45 @@ class Grasp:
     height of the underside relative to the box's bottom; row 0 is the box itself. m."""
 
 
+class Family(NamedTuple):
+    """Some grasps of a box, and what they are side by side."""
+
+    grasps: tuple[Grasp, ...]
+    axes: np.ndarray
+    """(G,)."""
+    parts: np.ndarray
+    """(G, 5, 5)."""
+
+
 def grasps(box: Box) -> tuple[Grasp, ...]:
     """The deep, centred grasps that the gripper's opening allows, narrower edge first."""
-    hand = _hand()
-    length, width, height = box.size
+    return deep_grasps(box).grasps
+
+
+def deep_grasps(box: Box) -> Family:
+    """The same with their arrays."""
+    return _deep(box.size)
+
+
+def other_grasps(box: Box) -> Family:
+    """The shallower and shifted grasps, edge by edge, each shift from deep to shallow."""
+    return _others(box.size)
+
+
+@lru_cache(maxsize=1024)
+def _deep(size: tuple[float, float, float]) -> Family:
+    hand, found = _hand(), []
+    length, width, height = size
     depth = min(DEPTH, max(height - 0.012, 0.3 * height, min(0.010, height - GROUND)))
-    if min(depth, height - GROUND) < GRIP:
-        return ()
+    sound = min(depth, height - GROUND) >= GRIP
     above = height / 2 - depth + hand.tip
-    found = []
     for axis in (0, 1) if length <= width else (1, 0):
-        closed = box.size[axis] / 2
+        closed = size[axis] / 2
         opening = closed + SPREAD
-        if opening > hand.max_opening:
+        if opening > hand.max_opening or not sound:
             continue
         parts = np.empty((2 + len(hand.fingers), 5))
-        parts[0] = 0.0, 0.0, closed, box.size[1 - axis] / 2, 0.0
+        parts[0] = 0.0, 0.0, closed, size[1 - axis] / 2, 0.0
         parts[1:-1] = hand.fingers
         parts[1:-1, 0] += hand.sides * opening
         parts[-1] = hand.palm
@@ -88,31 +111,43 @@ def grasps(box: Box) -> tuple[Grasp, ...]:
                 price=0.0, parts=parts,
             )
         )  # fmt: skip
-    return tuple(found)
+    return _family(found)
+
+
+@lru_cache(maxsize=1024)
+def _others(size: tuple[float, float, float]) -> Family:
+    found = []
+    for deep in _deep(size).grasps:
+        most = min(size[1 - deep.axis] / 2 - INSET, FARTHEST)
+        shifts = (0.0, 0.5 * most, -0.5 * most, most, -most) if most > INSET / 2 else (0.0,)
+        depths = (deep.depth, *(depth for depth in SHALLOW if depth < deep.depth - 0.002))
+        for shift in shifts:
+            for depth in depths:
+                if (shift, depth) == (0.0, deep.depth):
+                    continue
+                rise = deep.depth - depth
+                parts = deep.parts.copy()
+                parts[1:, 1] += shift
+                parts[1:, 4] += rise
+                found.append(
+                    Grasp(
+                        axis=deep.axis, opening=deep.opening, closed=deep.closed,
+                        above=deep.above + rise, depth=depth, shift=shift,
+                        price=PRICE * (rise + abs(shift)), parts=parts,
+                    )
+                )  # fmt: skip
+    return _family(found)
+
+
+def _family(found: list[Grasp]) -> Family:
+    axes = np.array([grasp.axis for grasp in found], np.int64)
+    parts = np.array([grasp.parts for grasp in found]).reshape(len(found), -1, 5)
+    return Family(tuple(found), axes, parts)
 
 
 def fits(box: Box) -> bool:
     """Whether the hand opens wide enough for one of its edges."""
     return min(box.size[:2]) / 2 + SPREAD <= _hand().max_opening
-
-
-def variants(box: Box, deep: Grasp) -> Iterator[Grasp]:
-    """The shallower and shifted grasps across the same edge, each shift from deep to shallow."""
-    most = min(box.size[1 - deep.axis] / 2 - INSET, FARTHEST)
-    shifts = (0.0, 0.5 * most, -0.5 * most, most, -most) if most > INSET / 2 else (0.0,)
-    depths = (deep.depth, *(depth for depth in SHALLOW if depth < deep.depth - 0.002))
-    for shift in shifts:
-        for depth in depths:
-            if (shift, depth) == (0.0, deep.depth):
-                continue
-            rise = deep.depth - depth
-            parts = deep.parts.copy()
-            parts[1:, 1] += shift
-            parts[1:, 4] += rise
-            yield Grasp(
-                axis=deep.axis, opening=deep.opening, closed=deep.closed, above=deep.above + rise,
-                depth=depth, shift=shift, price=PRICE * (rise + abs(shift)), parts=parts,
-            )  # fmt: skip
 
 
 def pick_target(box: Box, grasp: Grasp) -> np.ndarray:

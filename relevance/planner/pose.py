@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress, islice
 
 import numpy as np
 from numba import njit
 
-from relevance.planner.grasps import Grasp, grasps, variants
+from relevance.planner.grasps import Family, Grasp, deep_grasps, other_grasps
 from relevance.planner.kernels.boxes import UPRIGHT, rectangle_gap, upright
 from relevance.planner.kernels.kinematics import reach_interval
 from relevance.planner.problem import CLOSE, Problem, obstacle
@@ -71,15 +71,13 @@ class PoseBound:
         """The deep, centred grasps of an object, and who must have left before it can be picked
         that way."""
         if name not in self._blockers:
-            self._blockers[name] = self._blocked(name, grasps(self.problem.boxes[name]))
+            self._blockers[name] = self._blocked(name, deep_grasps(self.problem.boxes[name]))
         return self._blockers[name]
 
     def more_blockers(self, name: str) -> dict[Grasp, frozenset[str]]:
         """The same for the other grasps: each shift from deep to shallow."""
         if name not in self._more:
-            box = self.problem.boxes[name]
-            others = (more for deep in grasps(box) for more in variants(box, deep))
-            self._more[name] = self._blocked(name, others)
+            self._more[name] = self._blocked(name, other_grasps(self.problem.boxes[name]))
         return self._more[name]
 
     def in_the_way(self, name: str) -> frozenset[str]:
@@ -179,31 +177,31 @@ class PoseBound:
             self._intervals[z] = reach
         return self._intervals[z]
 
-    def _blocked(self, name: str, family: Iterable[Grasp]) -> dict[Grasp, frozenset[str]]:
+    def _blocked(self, name: str, family: Family) -> dict[Grasp, frozenset[str]]:
         problem, found = self.problem, {}
         began = time.process_time()
         problem.counts.pose += 1
         i, box, count = problem.index[name], problem.boxes[name], len(problem.boxes)
         x, y, _ = problem.scene.robot.base
         r = math.hypot(box.position[0] - x, box.position[1] - y)
-        reachable = []
-        for grasp in family:
-            near, far = self.interval(box.bottom, box, grasp)
-            problem.undecided |= min(abs(r - near), abs(r - far)) < CLOSE
-            if near <= r <= far:
-                reachable.append(grasp)
-        if reachable:
-            axes = np.array([grasp.axis for grasp in reachable])
-            parts = np.array([grasp.parts for grasp in reachable])
-            blocking = np.zeros((len(reachable), count), np.bool_)
-            gaps = pick_blockers(i, axes, parts, problem.obstacles[:count], blocking)
-            problem.undecided |= reachable[0].price == 0.0 and bool((gaps < CLOSE).any())
+        reached: dict[float, bool] = {}  # by the height of the hand
+        for grasp in family.grasps:
+            if grasp.above not in reached:
+                near, far = self.interval(box.bottom, box, grasp)
+                problem.undecided |= min(abs(r - near), abs(r - far)) < CLOSE
+                reached[grasp.above] = near <= r <= far
+        if any(reached.values()):
+            blocking = np.zeros((len(family.grasps), count), np.bool_)
+            boxes = problem.obstacles[:count]
+            gaps = pick_blockers(i, family.axes, family.parts, boxes, blocking)
             names, seen = list(problem.boxes), {}
-            for grasp, row in zip(reachable, blocking, strict=True):
-                bits = row.tobytes()
-                if bits not in seen:
-                    seen[bits] = frozenset(compress(names, row.tolist()))
-                found[grasp] = seen[bits]
+            for g, grasp in enumerate(family.grasps):
+                if reached[grasp.above]:
+                    bits = blocking[g].tobytes()
+                    if bits not in seen:
+                        seen[bits] = frozenset(compress(names, blocking[g].tolist()))
+                    found[grasp] = seen[bits]
+                    problem.undecided |= grasp.price == 0.0 and gaps[g] < CLOSE
         problem.seconds.pose += time.process_time() - began
         return found
 
