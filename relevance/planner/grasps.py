@@ -141,7 +141,7 @@ def _others(size: tuple[float, float, float]) -> Family:
 
 def _family(found: list[Grasp]) -> Family:
     axes = np.array([grasp.axis for grasp in found], np.int64)
-    parts = np.array([grasp.parts for grasp in found]).reshape(len(found), -1, 5)
+    parts = np.array([grasp.parts for grasp in found]) if found else np.empty((0, 5, 5))
     return Family(tuple(found), axes, parts)
 
 

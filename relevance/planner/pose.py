@@ -201,7 +201,7 @@ class PoseBound:
                     if bits not in seen:
                         seen[bits] = frozenset(compress(names, blocking[g].tolist()))
                     found[grasp] = seen[bits]
-                    problem.undecided |= grasp.price == 0.0 and gaps[g] < CLOSE
+                    problem.undecided |= grasp.price == 0.0 and bool(gaps[g] < CLOSE)
         problem.seconds.pose += time.process_time() - began
         return found
 
