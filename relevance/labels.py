@@ -199,6 +199,7 @@ def plan_row(
         "reference": result.goal.reference,
         "status": status,
         "reason": reason,
+        "blocking": list(result.blocking) or None,
         "actions": [action.to_list() for action in result.actions],
         "moved": list(result.moved),
         "alternatives": [list(names) for names in result.alternatives],

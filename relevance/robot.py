@@ -18,6 +18,8 @@ ARM = 7
 """Joints of the arm."""
 LINKS = ("panda_link5", "panda_link6", "panda_hand")
 """The links that come near the table: those whose boxes and frames the planner goes by."""
+UPPER_LINKS = ("panda_link1", "panda_link2", "panda_link3", "panda_link4")
+"""The links near the base, which only tall things can meet; their indices follow LINKS'."""
 HAND = 2
 """Index of the hand in LINKS."""
 HOME = np.array([0.0, -0.785398, 0.0, -2.356194, 0.0, 1.570796, 0.785398])
@@ -53,6 +55,8 @@ class Panda:
     """(7,) rad/s."""
     arm: tuple[tuple[int, np.ndarray, np.ndarray], ...]
     """Boxes around links: (index in LINKS, centre (3,), half extents (3,)) in that link's frame."""
+    upper_arm: tuple[tuple[int, np.ndarray, np.ndarray], ...]
+    """The same for UPPER_LINKS."""
     foot: tuple[np.ndarray, np.ndarray]
     """Box (centre, half extents) around the link that does not move, in the base's frame."""
     finger: tuple[tuple[np.ndarray, np.ndarray], ...]
@@ -111,6 +115,10 @@ def panda() -> Panda:
         upper=bounds[:, 1],
         velocity=bounds[:, 2],
         arm=arm,
+        upper_arm=tuple(
+            (len(LINKS) + i, *_box(_vertices(meshes / f"{name.removeprefix('panda_')}.obj")))
+            for i, name in enumerate(UPPER_LINKS)
+        ),
         foot=_box(_vertices(meshes / "link0.obj")),
         finger=(_slice(finger, middle, np.inf), _slice(finger, -np.inf, middle)),
         finger_tip=float(finger[:, 2].max()),

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from relevance.robot import panda_urdf
 from relevance.scene import (
     PREDICATES,
     Box,
@@ -27,7 +28,6 @@ from relevance.scene import (
     read_scenes,
 )
 from relevance.scene.contacts import robot_depth
-from relevance.robot import panda_urdf
 
 CASES = Path(__file__).parent / "cases"
 

@@ -32,7 +32,8 @@ def test_every_solved_plan_replays_and_reaches_its_goal(planned):
 def test_dense_check_of_the_plan_alone_equals_the_solvers(planned):
     for scene, _, result in planned:
         if result.status == "solved":
-            assert penetration(scene, result) == pytest.approx(result.max_penetration, abs=1e-6)
+            # The solver takes a held box to be where it was asked for, up to its tolerance.
+            assert penetration(scene, result) == pytest.approx(result.max_penetration, abs=2e-4)
     scene, _, result = next(task for task in planned if task[2].status == "solved")
     first = result.phases[0]
     lean = np.zeros(7)
@@ -95,7 +96,7 @@ def test_a_decision_that_a_tenth_of_a_millimetre_turns_is_flagged():
 
     def beside(gap):
         red = box("red", 0.0, 0.25, RED, size=(0.11, 0.05, 0.06))  # one grasp: fingers along y
-        green = box("green", 0.0, 0.30 + gap, GREEN)
+        green = box("green", 0.0, 0.30 + gap, GREEN, size=(0.12, 0.05, 0.06))
         result = plan(replace(OPEN, objects=(red, green, OPEN["blue"])), "on-the-right(red, blue)")
         assert result.status == "solved"
         return result
@@ -160,7 +161,7 @@ def test_infeasible_goals_say_why():
 def test_node_limit_is_a_status():
     result = plan(OPEN, "on-the-left(red, blue)", config=PlannerConfig(node_limit=1))
     assert result.status == "limit"
-    assert "node limit 1" in result.reason
+    assert result.reason.startswith("node limit: 1 ")
 
 
 def test_bad_input_is_one_clear_line():

@@ -151,12 +151,12 @@ def test_reach_interval_is_what_hand_down_reaches():
 def test_interpreted_kinematics_equal_compiled(monkeypatch):
     compiled = frames_at(np.linspace(-1, 1, 7))
     monkeypatch.setattr(native.shutil, "which", lambda name: None)
-    panda.cache_clear()
+    functions.cache_clear()
     try:
         with pytest.warns(UserWarning, match="no C compiler"):
             interpreted = frames_at(np.linspace(-1, 1, 7))
     finally:
-        panda.cache_clear()
+        functions.cache_clear()
     np.testing.assert_allclose(interpreted, compiled, atol=1e-12)
 
 
@@ -326,12 +326,12 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
         )
         region = np.array([0.0, 0.0, 0.2, 0.05, 0.03])
         near, far = reach_interval(0.15)
-        at = np.zeros(3)
-        common = (0.0, grasp.parts, obstacles, table, BASE, near, far)
+        at = np.zeros(4)
+        common = (0.0, grasp.parts[None], obstacles, table, BASE, np.array([near]), np.array([far]))
         status, _ = pose.find_pose(region, np.zeros(2), *common, 0.0, at)
         c, s = math.cos(0.2), math.sin(0.2)
         grid = max(
-            pose.slack(c * x - s * y, s * x + c * y, angle, *common)
+            pose.slack(c * x - s * y, s * x + c * y, angle, *common, 0.0)[0]
             for x in np.linspace(-0.05, 0.05, 15)
             for y in np.linspace(-0.03, 0.03, 9)
             for angle in np.linspace(0, math.pi, 24, endpoint=False)
@@ -341,7 +341,7 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
             assert grid < 0
         if status == FOUND:
             found += 1
-            assert pose.slack(*at, *common) >= 0
+            assert pose.slack(*at[:3], *common, 0.0)[0] >= 0
             local = np.array([[c, s], [-s, c]]) @ at[:2]
             assert (np.abs(local) <= [0.05, 0.03]).all()
     assert refused > 3

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from relevance.planner.kernels.kinematics import reach_interval
 
 from relevance.benchmarks import draw
 from relevance.benchmarks.reference import (
@@ -19,6 +18,7 @@ from relevance.benchmarks.reference import (
     shortest,
 )
 from relevance.planner import plan
+from relevance.planner.kernels.kinematics import reach_interval
 from relevance.scene import Box, Scene, footprint_gap, scene_from_json
 
 RED, GREEN, BLUE = (0.8, 0.1, 0.1), (0.1, 0.7, 0.1), (0.1, 0.1, 0.8)

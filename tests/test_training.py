@@ -20,7 +20,7 @@ from relevance.models import BODIES, RelevanceModel
 from relevance.models.glimpse import GlimpseConfig
 from relevance.models.vit import VitConfig
 from relevance.scene import PREDICATES, Camera
-from relevance.store import Dataset
+from relevance.store import Dataset, DatasetError
 from relevance.training import (
     TrainConfig,
     batch_loss,

@@ -264,7 +264,7 @@ def test_merging_refuses(made: Path, tmp_path: Path) -> None:
     file = twin / "dataset.json"
     said = json.loads(file.read_text())
     file.write_text(json.dumps({**said, "planner_version": "1"}))
-    with pytest.raises(DatasetError, match="planner_version: expected .* found 1"):
+    with pytest.raises(DatasetError, match=r"planner_version: expected .* found 1"):
         merge([made, twin], tmp_path / "c")
     assert not (tmp_path / "c").exists()
 

@@ -2,7 +2,7 @@
 
 from relevance.planner.checking import penetration
 from relevance.planner.guides import GUIDES, Guide, GuideError, Mode, Scorer
-from relevance.planner.rai.planner import RaiConfig
+from relevance.planner.rai.planner import Rai, RaiConfig
 from relevance.planner.result import (
     PLANNER_VERSION,
     PLANNERS,
@@ -13,7 +13,11 @@ from relevance.planner.result import (
     Seconds,
     Status,
 )
-from relevance.planner.search import plan, warm_up
+from relevance.planner.search import Ours, plan, warm_up
+from relevance.planner.trajectories import trajectory
+
+for _planner in (Ours(), Rai()):
+    PLANNERS.register(_planner.name, _planner)
 
 __all__ = [
     "GUIDES",
@@ -32,5 +36,6 @@ __all__ = [
     "Status",
     "penetration",
     "plan",
+    "trajectory",
     "warm_up",
 ]

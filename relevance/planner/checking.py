@@ -1,14 +1,53 @@
-"""The planner's own dense check, of a plan alone."""
+"""The planner's own check of what it found: dense, and able to fail."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
-from relevance.planner.grasps import bodies, carried, grasps
-from relevance.planner.path import dense_check, put_down
+from relevance.planner.grasps import bodies
+from relevance.planner.kernels.kinematics import FRAME, look_at_frames
+from relevance.planner.path import ALLOWED, Motion, dense_check, put_down
 from relevance.planner.problem import Problem
 from relevance.planner.result import PlanResult
-from relevance.scene import Scene
+from relevance.robot import HAND, panda
+from relevance.scene import Box, Pose, Scene, goal_holds
+
+SLACK = 1e-6
+"""What a limit may be exceeded by, relative to it or in rad: rounding."""
+
+
+def broken(problem: Problem, motion: Motion) -> str:
+    """What does not hold of a motion; empty if all does.
+
+    Joint limits and speeds at every sub-step (joint angles are linear between rows, so the rows
+    say it all), penetration as the path bound measured it, and the goal at the end.
+    """
+    arm = panda()
+    for number, phase in enumerate(motion.phases):
+        over = np.maximum(arm.lower - phase.q, phase.q - arm.upper).max(axis=0)
+        if over.max() > SLACK:
+            joint = int(over.argmax())
+            return f"phase {number}: joint {joint + 1} exceeds its limit by {over[joint]:.4f} rad"
+        speed = (np.abs(np.diff(phase.q, axis=0)) / arm.velocity).max() / phase.dt
+        if speed > 1 + SLACK:
+            return f"phase {number}: a joint moves at {speed:.2f} times its speed limit"
+    if motion.max_penetration > ALLOWED:
+        return f"something is penetrated by {1000 * motion.max_penetration:.1f} mm"
+    ends = {problem.goal.subject, problem.goal.reference}
+    boxes = [at_last(problem.boxes[name], motion.final.get(name)) for name in ends]
+    if not goal_holds(boxes, problem.goal, problem.scene.robot):
+        return f"the goal {problem.goal} is not true at the end"
+    return ""
+
+
+def at_last(box: Box, pose: Pose | None) -> Box:
+    """The box where a plan leaves it."""
+    if pose is None:
+        return box
+    return replace(box, position=pose.position, yaw=pose.yaw, on=pose.on)
 
 
 def penetration(scene: Scene, result: PlanResult) -> float:
@@ -19,18 +58,30 @@ def penetration(scene: Scene, result: PlanResult) -> float:
     problem = Problem(scene, result.goal)
     obstacles = problem.obstacles.copy()
     there = np.ones(len(obstacles), np.bool_)
-    worst = 0.0
+    worst, held = 0.0, None
     for k, phase in enumerate(result.phases):
         name, holding = result.moved[k // 3], k % 3 == 1
-        box, i = problem.boxes[name], problem.index[name]
-        opening = "closed" if holding else "opening"
-        grasp = next(g for g in grasps(box) if getattr(g, opening) == phase.opening)
+        i = problem.index[name]
+        if holding:
+            held = _held(problem, name, result.phases[k - 1].q[-1])
         there[i] = not holding
         if k % 3 == 2:  # the retreat
             pose = result.final[name]
             put_down(obstacles[i], pose.position, pose.yaw)
-        body = bodies(phase.opening, carried(box, grasp) if holding else None)
-        margin, broken = np.zeros((len(body.link), there.sum())), np.zeros((len(phase.q) - 1, 2))
-        depth = dense_check(phase.q, problem.arm, body, obstacles[there], margin, broken)
+        body = bodies(phase.opening, held if holding else None)
+        margin, over = np.zeros((len(body.link), there.sum())), np.zeros((len(phase.q) - 1, 2))
+        depth = dense_check(phase.q, problem.arm, body, obstacles[there], margin, over)
         worst = max(worst, depth)
     return worst
+
+
+def _held(problem: Problem, name: str, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and half extents in the hand's frame of a box that the hand takes at q (7,), m."""
+    box = problem.boxes[name]
+    look_at_frames(problem.arm, q)
+    frame = problem.arm.frames_y[HAND * FRAME :]
+    R = frame[3:12].reshape(3, 3)
+    centre = R.T @ (np.array(box.position) - frame[:3])
+    along = abs(math.cos(math.atan2(R[1, 1], R[0, 1]) - box.yaw)) > 0.5  # fingers along its x
+    sizes = (box.size[1], box.size[0]) if along else box.size[:2]
+    return centre, np.array([*sizes, box.size[2]]) / 2

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from relevance.planner.grasps import bodies, carried, pick_target
+from relevance.planner.grasps import bodies, carried, hand_target, pick_target
 from relevance.planner.kernels.boxes import (
     body_pose,
     dense_solve,
@@ -26,9 +26,14 @@ from relevance.planner.kernels.boxes import (
     point_gradient,
     separation,
 )
-from relevance.planner.kernels.kinematics import FRAME, hand_down, look_at_frames, look_at_grasp
-from relevance.planner.pose import Placement, interval, moved_box
-from relevance.planner.problem import Problem
+from relevance.planner.kernels.kinematics import (
+    FRAME,
+    Arm,
+    hand_down,
+    look_at_frames,
+    look_at_grasp,
+)
+from relevance.planner.pose import Placement, PoseBound, moved_box
 from relevance.robot import ARM, HOME, panda
 from relevance.scene.geometry import UPRIGHT, upright
 
@@ -55,7 +60,8 @@ class Switches(NamedTuple):
     place_z: np.ndarray
     """(m,) height of the hand at each place, m."""
     turn: np.ndarray
-    """(m, 2): angle of the finger axis minus the box's yaw, and the placed box's height."""
+    """(m, 3): angle of the finger axis minus the box's yaw, the placed box's height, and how far
+    the hand is shifted."""
     link: np.ndarray
     """(2m, B) bodies at each switch, as in `Bodies`; the first n_bodies[k] count."""
     centre: np.ndarray
@@ -80,8 +86,8 @@ class Switches(NamedTuple):
 class KeyframeBound:
     """Solves the keyframe NLP of an order of moves."""
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+    def __init__(self, pose: PoseBound) -> None:
+        self.problem, self.pose = pose.problem, pose
 
     def solve(
         self, order: tuple[str, ...], placements: list[Placement]
@@ -97,7 +103,6 @@ class KeyframeBound:
         self, order: tuple[str, ...], placements: list[Placement]
     ) -> tuple[np.ndarray, np.ndarray] | None:
         arm, at, problem, m = panda(), self.problem.arm, self.problem, len(order)
-        base = problem.scene.robot.base
         moved = np.full(len(problem.obstacles), -1)
         stands = np.ones((2 * m, len(problem.obstacles)), np.bool_)
         supports = np.full(m, len(problem.boxes))  # the table
@@ -105,7 +110,7 @@ class KeyframeBound:
         link, n_bodies = np.zeros((2 * m, widest), np.int64), np.zeros(2 * m, np.int64)
         centre, half = np.zeros((2 * m, widest, 3)), np.zeros((2 * m, widest, 3))
         radius = np.zeros((2 * m, widest))
-        pick, place_z, turn = np.zeros((m, 4)), np.zeros(m), np.zeros((m, 2))
+        pick, place_z, turn = np.zeros((m, 4)), np.zeros(m), np.zeros((m, 3))
         bounds = np.zeros((m, 4))
         x = np.zeros(17 * m)
         p0, weight = np.zeros(3 * m), np.zeros(3 * m)
@@ -120,24 +125,23 @@ class KeyframeBound:
             moved[problem.index[name]] = j
             pick[j] = pick_target(box, grasp)
             place_z[j] = bottom + box.size[2] / 2 + grasp.above
-            turn[j] = grasp.axis * math.pi / 2, bottom + box.size[2] / 2
+            turn[j] = grasp.axis * math.pi / 2, bottom + box.size[2] / 2, grasp.shift
+            put = hand_target(*place.pose[:2], place_z[j], place.pose[2], grasp.shift)
+            way = _start(at, (pick[j], put), x[14 * j : 14 * j + 14], shifted=grasp.shift != 0)
+            if way == 0:
+                return None
             p0[3 * j : 3 * j + 3] = place.pose
             for k in (2 * j, 2 * j + 1):
-                held = carried(box, grasp) if k % 2 else None
+                held = carried(box, grasp, way) if k % 2 else None
                 body = bodies(grasp.opening, held)
                 n_bodies[k] = count = len(body.link)
                 link[k, :count], centre[k, :count], half[k, :count], radius[k, :count] = body
                 stands[k, problem.index[name]] = False
             c, s = abs(math.cos(place.pose[2])), abs(math.sin(place.pose[2]))
-            along, across = grasp.parts[0, 1], grasp.parts[0, 2]
+            along, across = grasp.parts[0, 2], grasp.parts[0, 3]
             bounds[j, :2] = problem.table
             bounds[j, :2] -= c * along + s * across, s * along + c * across
-            bounds[j, 2:] = interval(base, bottom, box, grasp)
-            target = np.array([*place.pose[:2], place_z[j], place.pose[2]])
-            for k, t in ((2 * j, pick[j]), (2 * j + 1, target)):
-                q = x[k * ARM : (k + 1) * ARM]
-                if not hand_down(t, at.base, at.lower, at.upper, q):
-                    return None
+            bounds[j, 2:] = self.pose.interval(bottom, box, grasp)
         x[14 * m :] = p0
         switches = Switches(
             HOME, pick, place_z, turn, link, centre, half, radius, n_bodies, problem.obstacles,
@@ -153,6 +157,21 @@ class KeyframeBound:
             if solve(x, at, switches, p0, weight) <= TOLERANCE:
                 return x[: 14 * m].reshape(2 * m, ARM), x[14 * m :].reshape(m, 3)
         return None
+
+
+def _start(arm: Arm, targets: tuple[np.ndarray, ...], q: np.ndarray, *, shifted: bool) -> float:
+    """Fill q (14,) with configurations for the pick and the place of one box.
+
+    Returns which way round the hand is (1, -1), 0 where it does not reach both: a shifted hand
+    must be the same way round at both, any other is symmetric.
+    """
+    for way in (1.0, -1.0) if shifted else (0.0,):
+        if all(
+            hand_down(target, arm.base, arm.lower, arm.upper, q[k * ARM : (k + 1) * ARM], way)
+            for k, target in enumerate(targets)
+        ):
+            return way or 1.0
+    return 0.0
 
 
 @njit(cache=True)
@@ -206,7 +225,9 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
         j, placing = k // 2, k % 2 == 1
         at = first + 3 * j
         if placing:
-            target[0], target[1] = x[at], x[at + 1]
+            shift = switches.turn[j, 2]
+            c, s = math.cos(x[at + 2]), math.sin(x[at + 2])
+            target[0], target[1] = x[at] - shift * s, x[at + 1] + shift * c
             target[2], target[3] = switches.place_z[j], x[at + 2]
         else:
             target[:] = switches.pick[j]
@@ -221,6 +242,9 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                 for i in range(3):
                     index[count] = at + i
                     row[count] = arm.grasp_y[48 + r * 4 + (3 if i == 2 else i)]
+                    if i == 2:
+                        dx, dy = arm.grasp_y[48 + r * 4], arm.grasp_y[48 + r * 4 + 1]
+                        row[count] -= shift * (c * dx + s * dy)
                     count += 1
             value = arm.grasp_y[r]
             eq[k, r] += gain * value
@@ -241,9 +265,13 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
             body_pose(frame, switches.centre[k, b], p, R)
             for w in range(len(obstacles)):
                 held = b == switches.n_bodies[k] - 1
-                if not switches.stands[k, w] or (placing and held and w == switches.support[j]):
+                if not switches.stands[k, w]:
                     continue
                 o[:] = obstacles[w]
+                if placing and held:  # what is not above its support is not in its way
+                    under = switches.turn[j, 1] - switches.half[k, b, 2]
+                    if w == switches.support[j] or o[2] + o[6] <= under + 1e-6:
+                        continue
                 other = switches.moved[w]
                 free = other >= 0 and other < j
                 if free:

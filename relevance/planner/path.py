@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from relevance.planner.grasps import bodies, carried, pick_target
+from relevance.planner.grasps import bodies, carried, hand_target, pick_target, upper_bodies
 from relevance.planner.kernels.boxes import (
     banded_solve,
     body_pose,
@@ -25,7 +25,14 @@ from relevance.planner.kernels.boxes import (
     point_gradient,
     separation,
 )
-from relevance.planner.kernels.kinematics import FRAME, finger_turn, look_at_frames, look_at_grasp
+from relevance.planner.kernels.kinematics import (
+    FRAME,
+    finger_turn,
+    finger_way,
+    look_at_frames,
+    look_at_grasp,
+)
+from relevance.planner.kernels.rows import WIDTH, acceleration_cost, smoothness, time_step
 from relevance.planner.logic import actions
 from relevance.planner.pose import Placement
 from relevance.planner.problem import Problem
@@ -39,10 +46,6 @@ VERTICAL = 3
 """Rows beside a switch at which the hand is straight over it."""
 RISE = 0.06
 """Height of the vertical parts, m."""
-STEP = 0.1
-"""Shortest time between rows, s."""
-SPEED = 0.9
-"""Share of the velocity limits that motions use."""
 CLEARANCE = 0.002
 """Clearance asked for along the way, m; less where a switch itself leaves less."""
 SUBSTEPS = 8
@@ -57,7 +60,6 @@ ROUGH_STEP = 1e-2
 """The same before the multipliers are set for the first time, rad."""
 TOLERANCE = 4e-4
 """Largest violation of a solved problem, m or rad."""
-_WIDTH = 3 * ARM
 _EXCHANGES = 4
 
 
@@ -69,7 +71,7 @@ class Motion:
     phases: tuple[Phase, ...]
     final: dict[str, Pose]
     cost: float
-    """Squared joint accelerations, summed over rows, rad^2."""
+    """Squared joint accelerations, summed over rows, and the prices of the holds, rad^2."""
     max_penetration: float
     """Deepest penetration at the sub-steps of the dense check, m."""
 
@@ -79,6 +81,30 @@ class PathBound:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
+
+    def _motion(
+        self,
+        X: np.ndarray,
+        leave: np.ndarray,
+        leaving: bool,
+        arrive: np.ndarray,
+        opening: float,
+        held: tuple[np.ndarray, np.ndarray] | None,
+        obstacles: np.ndarray,
+    ) -> tuple[float, float, float]:
+        """`motion`; among tall things once more with every link, where it brings one too near."""
+        problem = self.problem
+        found = motion(X, problem.arm, leave, leaving, arrive, bodies(opening, held), obstacles)
+        tall = obstacles[: len(problem.boxes) - (held is not None)]
+        if found[0] < 0 or not problem.tall or not len(tall):
+            return found
+        upper = upper_bodies()
+        margin, broken = np.zeros((len(upper.link), len(tall))), np.zeros((len(X) - 1, 2))
+        if dense_check(X, problem.whole_arm, upper, tall, margin, broken) <= ALLOWED:
+            return found
+        # The foot is under the links near the base: they are not asked to keep clear of it.
+        every = bodies(opening, held, upper=True)
+        return motion(X, problem.whole_arm, leave, leaving, arrive, every, obstacles[:-1])
 
     def solve(
         self,
@@ -117,21 +143,22 @@ class PathBound:
                 bottom = obstacles[problem.index[on], 2] + obstacles[problem.index[on], 6]
             take = pick_target(box, grasp)
             z = bottom + box.size[2] / 2 + grasp.above
-            put = np.array([poses[j, 0], poses[j, 1], z, poses[j, 2]])
-            free = bodies(grasp.opening)
-            held = bodies(grasp.closed, carried(box, grasp))
-            for k, (arrive, body, opening) in enumerate(
-                ((take, free, grasp.opening), (put, held, grasp.closed))
+            put = hand_target(poses[j, 0], poses[j, 1], z, poses[j, 2], grasp.shift)
+            in_hand = carried(box, grasp, finger_way(arm, q[2 * j], take[3]))
+            for k, (arrive, hold, opening) in enumerate(
+                ((take, None, grasp.opening), (put, in_hand, grasp.closed))
             ):
                 problem.counts.path += 1
                 there[i] = k == 0
                 X = np.empty((ROWS + 1, ARM))
                 X[0], X[-1] = at, q[2 * j + k]
-                depth, effort, dt = motion(X, arm, leave, leaving, arrive, body, obstacles[there])
+                depth, effort, dt = self._motion(
+                    X, leave, leaving, arrive, opening, hold, obstacles[there]
+                )
                 if depth < 0:
                     return None
-                action, in_hand = sequence[2 * j + k], name if k else None
-                phases.append(Phase(action=action, q=X, dt=dt, opening=opening, carried=in_hand))
+                action, held = sequence[2 * j + k], name if k else None
+                phases.append(Phase(action=action, q=X, dt=dt, opening=opening, carried=held))
                 cost, worst = cost + effort, max(worst, depth)
                 at, leave, leaving = X[-1], arrive, True
             there[i] = True
@@ -142,11 +169,12 @@ class PathBound:
             final[name] = Pose(position=position, yaw=yaw, on=on)
             X = np.empty((2 * VERTICAL + 1, ARM))
             X[0] = at
+            free = bodies(grasp.opening)
             depth, effort, dt = retreat(X, arm, put, free, obstacles[there])
             if not 0 <= depth <= ALLOWED:
                 return None
             phases.append(Phase(action=None, q=X, dt=dt, opening=grasp.opening, carried=None))
-            cost, worst = cost + effort, max(worst, depth)
+            cost, worst = cost + effort + grasp.price, max(worst, depth)
             at, leaving = X[-1], False
         return Motion(
             order=order, phases=tuple(phases), final=final, cost=cost, max_penetration=worst
@@ -203,24 +231,6 @@ def distances(arm, q, bodies, obstacles, out):
             out[b, w] = 1.0
             if near(p, bodies.radius[b] + FAR, obstacles[w]):
                 out[b, w] = separation(p, R, bodies.half[b], obstacles[w], normal, contact)
-
-
-@njit(cache=True)
-def smoothness(T):
-    """Second derivative of half the squared accelerations, (n, 3 * ARM) as for `banded_solve`."""
-    band = np.zeros(((T - 1) * ARM, _WIDTH))
-    for t in range(T + 1):
-        for i in range(ARM):
-            for u in range(-1, 2):
-                for v in range(-1, u + 1):
-                    row, column = t + u, t + v
-                    if column < 1 or row > T - 1:
-                        continue
-                    product = (-2.0 if u == 0 else 1.0) * (-2.0 if v == 0 else 1.0)
-                    band[(column - 1) * ARM + i, (row - column) * ARM] += product
-    for i in range(len(band)):
-        band[i, 0] += 1e-6
-    return band
 
 
 @njit(cache=True)
@@ -323,7 +333,7 @@ def solve(X, arm, bodies, obstacles, margin, samples, targets):
     """
     T = len(X) - 1
     n = (T - 1) * ARM
-    smooth, band, g = smoothness(T), np.zeros((n, _WIDTH)), np.zeros(n)
+    smooth, band, g = smoothness(T), np.zeros((n, WIDTH)), np.zeros(n)
     eq, limit = np.zeros((T + 1, 6)), np.zeros((T + 1, ARM, 2))
     ineq = np.zeros((len(samples), len(bodies.link), len(obstacles)))
     old, step = X.copy(), np.zeros(n)
@@ -560,24 +570,3 @@ def retreat(X, arm, leave, bodies, obstacles) -> tuple[float, float, float]:
     margin = np.zeros((len(bodies.link), len(obstacles)))
     depth = dense_check(X, arm, bodies, obstacles, margin, np.zeros((steps, 2)))
     return depth, acceleration_cost(X), time_step(arm, X)
-
-
-@njit(cache=True)
-def time_step(arm, X):
-    """Seconds between rows such that no joint exceeds its share of the velocity limit."""
-    slowest = STEP
-    for t in range(len(X) - 1):
-        for i in range(ARM):
-            slowest = max(slowest, abs(X[t + 1, i] - X[t, i]) / arm.velocity[i] / SPEED)
-    return slowest
-
-
-@njit(cache=True)
-def acceleration_cost(X):
-    """Sum of squared second differences of the rows, at rest before and after, rad^2."""
-    total, T = 0.0, len(X) - 1
-    for t in range(T + 1):
-        for i in range(ARM):
-            a = X[max(t - 1, 0), i] - 2 * X[t, i] + X[min(t + 1, T), i]
-            total += a * a
-    return total

@@ -13,12 +13,12 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
+from itertools import compress, islice
 
 import numpy as np
 from numba import njit
 
-from relevance.planner.grasps import Grasp, grasps, pick_target
+from relevance.planner.grasps import Family, Grasp, deep_grasps, other_grasps
 from relevance.planner.kernels.kinematics import reach_interval
 from relevance.planner.problem import CLOSE, Problem, obstacle
 from relevance.scene import Box
@@ -40,6 +40,8 @@ REACH_MARGIN = 0.004
 """Distance kept from the ends of the arm's reach, m."""
 REFERENCE_PLACES = ((0.0, 0.0), (-0.1, 0.25), (-0.1, -0.25), (0.1, 0.15), (0.1, -0.15))
 """Where to look for room for a reference that is moved (x, y), m."""
+HAND_REACH = 0.2
+"""Farther from a box nothing is in the way of the hand that takes it, m."""
 SKY = 2.0
 """Height up to which the hand and what is above it count as an obstacle, m."""
 
@@ -61,81 +63,147 @@ class PoseBound:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self._blockers: dict[str, dict[Grasp, frozenset[str]]] = {}
-        self._goal_poses: dict[tuple, tuple[float, float, float] | None] = {}
+        self._more: dict[str, dict[Grasp, frozenset[str]]] = {}
+        self._goal_poses: dict[tuple, Placement | None] = {}
+        self._intervals: dict[float, tuple[float, float]] = {}
 
     def blockers(self, name: str) -> dict[Grasp, frozenset[str]]:
-        """The grasps of an object, and who must have left before it can be picked that way."""
-        problem = self.problem
+        """The deep, centred grasps of an object, and who must have left before it can be picked
+        that way."""
         if name not in self._blockers:
-            began = time.process_time()
-            problem.counts.pose += 1
-            i, box, found = problem.index[name], problem.boxes[name], {}
-            count = len(problem.boxes)
-            boxes, blocking = problem.obstacles[:count], np.zeros(count, np.bool_)
-            for grasp in grasps(box):
-                if self._reachable(box, grasp):
-                    gap = pick_blockers(i, grasp.axis, grasp.parts, boxes, blocking)
-                    problem.undecided |= gap < CLOSE
-                    found[grasp] = frozenset(compress(problem.boxes, blocking.tolist()))
-            self._blockers[name] = found
-            problem.seconds.pose += time.process_time() - began
+            self._blockers[name] = self._blocked(name, deep_grasps(self.problem.boxes[name]))
         return self._blockers[name]
+
+    def more_blockers(self, name: str) -> dict[Grasp, frozenset[str]]:
+        """The same for the other grasps: each shift from deep to shallow."""
+        if name not in self._more:
+            self._more[name] = self._blocked(name, other_grasps(self.problem.boxes[name]))
+        return self._more[name]
+
+    def in_the_way(self, name: str) -> frozenset[str]:
+        """Whoever blocks a pick of the object by some grasp, or stands on it."""
+        sets = (*self.blockers(name).values(), *self.more_blockers(name).values())
+        return self.problem.above[name].union(*sets)
 
     def grasps(self, name: str) -> tuple[Grasp, ...]:
         """The grasps with which an object can be reached where it stands at first."""
-        return tuple(self.blockers(name))
+        return tuple(self.blockers(name)) or tuple(self.more_blockers(name))
 
-    def pickable(self, name: str, gone: frozenset[str]) -> tuple[Grasp, ...]:
-        """Grasps with which the object can be taken once the objects in `gone` have left."""
+    def pickable(self, name: str, gone: frozenset[str]) -> bool:
+        """Whether the object can be taken once the objects in `gone` have left."""
+        return bool(self._deep(name, gone) or self._others(name, gone))
+
+    def _deep(self, name: str, gone: frozenset[str]) -> tuple[Grasp, ...]:
         self.problem.counts.pose += 1
         if not self.problem.above[name] <= gone:
             return ()
         return tuple(grasp for grasp, who in self.blockers(name).items() if who <= gone)
 
-    def goal_pose(
-        self, gone: frozenset[str], grasp: Grasp, reference: Box
-    ) -> tuple[float, float, float] | None:
-        """A free pose of the subject that makes the goal true once `gone` have left.
+    def _others(self, name: str, gone: frozenset[str]) -> tuple[Grasp, ...]:
+        if not self.problem.above[name] <= gone:
+            return ()
+        return tuple(grasp for grasp, who in self.more_blockers(name).items() if who <= gone)
 
-        None refuses every sequence that moves no others: whoever has left is ignored here, so
-        the bound is a relaxation.
+    def choices(self, name: str, gone: frozenset[str]) -> Iterator[tuple[Grasp, ...]]:
+        """Ways to take an object, the best first: one deep grasp each, then all others across one
+        edge."""
+        yield from ((grasp,) for grasp in self._deep(name, gone))
+        others = self._others(name, gone)
+        for axis in dict.fromkeys(grasp.axis for grasp in others):
+            yield tuple(grasp for grasp in others if grasp.axis == axis)
+
+    def goal_poses(
+        self, gone: frozenset[str], reference: Box, *, everywhere: bool = False
+    ) -> Iterator[Placement]:
+        """Free poses of the subject that make the goal true once `gone` have left, lazily.
+
+        None at all refuses every sequence that moves no others: whoever has left is ignored here,
+        so the bound is a relaxation. everywhere: by any grasp, whatever blocks or burdens it.
         """
-        key = (gone, grasp.axis, reference.position, reference.yaw)
-        if key in self._goal_poses:
-            return self._goal_poses[key]
         problem = self.problem
         subject = problem.subject
-        bottom = reference.top if problem.goal.predicate.stacked else 0.0
-        standing = problem.standing(gone | {subject.name, reference.name})
-        standing = np.vstack([standing, obstacle(reference)])
-        area = problem.goal_region(reference)
-        self._goal_poses[key] = self._find(area, area[:2], bottom, subject, grasp, standing)
-        return self._goal_poses[key]
+        standing: np.ndarray | None = None
+        taken = frozenset(problem.boxes) if everywhere else gone
+        for choice in self.choices(subject.name, taken):
+            key = (gone, choice, reference.position, reference.yaw)
+            if key not in self._goal_poses:
+                bottom = reference.top if problem.goal.predicate.stacked else 0.0
+                if standing is None:
+                    standing = problem.standing(gone | {subject.name, reference.name})
+                    standing = np.vstack([standing, obstacle(reference)])
+                area = problem.goal_region(reference)
+                found = self._find(area, area[:2], bottom, subject, choice, standing)
+                self._goal_poses[key] = found
+            found = self._goal_poses[key]
+            if found is not None:
+                yield found
 
-    def place_all(self, order: tuple[str, ...], grasp: Grasp) -> list[Placement] | None:
+    def place_all(self, order: tuple[str, ...], tries: int = 3) -> Iterator[list[Placement]]:
         """Poses for every moved box: first the subject's, then the others' around it.
 
         Placing the subject first loses fewer tasks than placing greedily in time order.
         """
         subject = self.problem.subject
-        gone = frozenset(order)
+        gone = frozenset(order) - {subject.name}
         for reference in self._references(order):
-            pose = self.goal_pose(gone - {subject.name}, grasp, reference)
-            if pose is None:
-                continue
-            bottom = reference.top if self.problem.goal.predicate.stacked else 0.0
-            kept = volumes(grasp.parts, pose, bottom, bottom + subject.size[2], SKY)
-            found = self._place_blockers(order, kept, reference)
-            if found is not None:
-                return [*found, Placement(grasp=grasp, pose=pose)]
-        return None
+            for place in islice(self.goal_poses(gone, reference), tries):
+                bottom = reference.top if self.problem.goal.predicate.stacked else 0.0
+                parts = place.grasp.parts
+                kept = volumes(parts, place.pose, bottom, bottom + subject.size[2], SKY)
+                found = self._place_blockers(order, kept, reference)
+                if found is not None:
+                    yield [*found, place]
+                    if place.grasp.shift:
+                        yield from ([*found, twin] for twin in self._twins(gone, place))
 
-    def _reachable(self, box: Box, grasp: Grasp) -> bool:
-        base = self.problem.scene.robot.base
-        near, far = interval(base, box.bottom, box, grasp)
-        r = math.hypot(box.position[0] - base[0], box.position[1] - base[1])
-        self.problem.undecided |= min(abs(r - near), abs(r - far)) < CLOSE
-        return near <= r <= far
+    def _twins(self, gone: frozenset[str], place: Placement) -> Iterator[Placement]:
+        """The subject taken on its other side and put down half a turn further: the hand ends at
+        the same place, but the other way round."""
+        x, y, angle = place.pose
+        grasp = place.grasp
+        for other in self._others(self.problem.goal.subject, gone):
+            same = other.axis == grasp.axis and other.depth == grasp.depth
+            if same and other.shift == -grasp.shift:
+                yield Placement(grasp=other, pose=(x, y, angle + math.pi))
+
+    def interval(self, bottom: float, box: Box, grasp: Grasp) -> tuple[float, float]:
+        """Reach (near, far) for holding the box with its underside at this height, liftably, m."""
+        # Heights in whole millimetres, to compute each once; REACH_MARGIN covers the rest.
+        z = round(bottom + box.size[2] / 2 + grasp.above - self.problem.scene.robot.base[2], 3)
+        if z not in self._intervals:
+            near, far = reach_interval(z)
+            near_up, far_up = reach_interval(round(z + LIFT, 3))
+            reach = max(near, near_up) + REACH_MARGIN, min(far, far_up) - REACH_MARGIN
+            self._intervals[z] = reach
+        return self._intervals[z]
+
+    def _blocked(self, name: str, family: Family) -> dict[Grasp, frozenset[str]]:
+        problem, found = self.problem, {}
+        began = time.process_time()
+        problem.counts.pose += 1
+        i, box, count = problem.index[name], problem.boxes[name], len(problem.boxes)
+        x, y, _ = problem.scene.robot.base
+        r = math.hypot(box.position[0] - x, box.position[1] - y)
+        reached: dict[float, bool] = {}  # by the height of the hand
+        for grasp in family.grasps:
+            if grasp.above not in reached:
+                near, far = self.interval(box.bottom, box, grasp)
+                problem.undecided |= min(abs(r - near), abs(r - far)) < CLOSE
+                reached[grasp.above] = near <= r <= far
+        if any(reached.values()):
+            blocking = np.zeros((len(family.grasps), count), np.bool_)
+            boxes = problem.obstacles[:count]
+            gaps = pick_blockers(i, family.axes, family.parts, boxes, blocking)
+            names, seen = list(problem.boxes), {}
+            for g, grasp in enumerate(family.grasps):
+                if reached[grasp.above]:
+                    bits = blocking[g].tobytes()
+                    if bits not in seen:
+                        seen[bits] = frozenset(compress(names, blocking[g].tolist()))
+                    found[grasp] = seen[bits]
+                    problem.undecided |= grasp.price == 0.0 and bool(gaps[g] < CLOSE)
+        problem.seconds.pose += time.process_time() - began
+        return found
 
     def _find(
         self,
@@ -143,27 +211,60 @@ class PoseBound:
         prefer: Sequence[float] | np.ndarray,
         bottom: float,
         box: Box,
-        grasp: Grasp,
+        choice: tuple[Grasp, ...],
         obstacles: np.ndarray,
-    ) -> tuple[float, float, float] | None:
-        """A pose in an area (5,) at which the box can be put down clear of obstacles (W, UPRIGHT).
+    ) -> Placement | None:
+        """How the box can be put down in an area (5,), clear of obstacles (W, UPRIGHT).
 
+        choice: grasps across one edge. Of those with equal shift the shallowest, which is in
+        nobody's way when a deeper one is not, decides; the deepest that is as free is taken.
         bottom: height of what it is put on, m.
         """
         began, problem = time.process_time(), self.problem
         problem.counts.pose += 1
-        near, far = interval(problem.scene.robot.base, bottom, box, grasp)
-        pose = np.zeros(3)
+        shallow = list({grasp.shift: grasp for grasp in choice}.values())
+        # Shifted to one side, or to the other and turned: the hand is at the same place.
+        sides = {
+            -grasp.shift if turn else grasp.shift: (grasp, turn)
+            for turn in (1, 0)
+            for grasp in shallow
+        }
+        ways = sorted(sides.values(), key=lambda way: way[0].price)
+        pose, prefer = np.zeros(4), np.array(prefer)
+        table, at = problem.table, problem.arm.base
+
+        def bounds(held: list[tuple[Grasp, int]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            parts = np.array([_turned(one.parts) if turn else one.parts for one, turn in held])
+            reach = np.array([self.interval(bottom, box, grasp) for grasp, _ in held]).T
+            return parts, np.ascontiguousarray(reach[0]), np.ascontiguousarray(reach[1])
+
+        parts, near, far = bounds(ways)
 
         def find(ease: float) -> tuple[int, float]:
             return find_pose(
-                area, np.array(prefer), bottom, grasp.parts, obstacles, problem.table,
-                problem.arm.base, near, far, ease, pose,
-            )  # fmt: skip
+                area, prefer, bottom, parts, obstacles, table, at, near, far, ease, pose
+            )
 
-        status, slack = find(0.0)
-        found = (float(pose[0]), float(pose[1]), float(pose[2])) if status == FOUND else None
-        close = slack < CLOSE if found else status == UNDECIDED or find(CLOSE)[0] != NONE
+        status, spare = find(0.0)
+        found = None
+        if status == FOUND:
+            x, y, angle = (float(value) for value in pose[:3])
+            grasp, turn = ways[int(pose[3])]
+            for deeper in choice:
+                if deeper.shift == grasp.shift and deeper.depth > grasp.depth:
+                    held = bounds([(deeper, turn)])
+                    there = (x, y, angle, bottom, held[0], obstacles, table, at, *held[1:])
+                    value, _ = slack(*there, 0.0)
+                    if value >= 0:
+                        grasp = deeper
+                        break
+            found = Placement(grasp=grasp, pose=(x, y, angle + turn * math.pi))
+        if len(choice) == 1:
+            close = spare < CLOSE if found else status == UNDECIDED or find(CLOSE)[0] != NONE
+        else:
+            close = status == UNDECIDED
+        if status == UNDECIDED:
+            problem.open.add("whether there is a free pose")
         problem.undecided |= close
         problem.seconds.pose += time.process_time() - began
         return found
@@ -176,11 +277,11 @@ class PoseBound:
             return
         i = order.index(reference.name)
         obstacles = self._when_landing(order, i, reference)
-        grasp = self.pickable(reference.name, frozenset(order[:i]))[0]
+        choice = next(self.choices(reference.name, frozenset(order[:i])))
         for prefer in REFERENCE_PLACES:
-            pose = self._find(self._table(), prefer, 0.0, reference, grasp, obstacles)
-            if pose is not None:
-                yield moved_box(reference, Placement(grasp=grasp, pose=pose))
+            place = self._find(self._table(), prefer, 0.0, reference, choice, obstacles)
+            if place is not None:
+                yield moved_box(reference, place)
 
     def _when_landing(self, order: tuple[str, ...], i: int, box: Box) -> np.ndarray:
         """What the i-th moved box must stay clear of: the boxes that still stand then, and where
@@ -210,16 +311,16 @@ class PoseBound:
                 area = np.array([*prefer, 0.0, 0.002, 0.002])
             elif reference.name in order[i:]:
                 grasp = self.grasps(reference.name)[0]
-                pose = (*reference.position[:2], reference.yaw + grasp.axis * math.pi / 2)
+                angle = reference.yaw + grasp.axis * math.pi / 2
+                pose = (*reference.position[:2], angle)
                 there = volumes(grasp.parts, pose, 0.0, reference.top, SKY)
                 reserved = np.vstack([kept, there])
             reserved = reserved[_underside(reserved) < box.size[2] + MARGIN]
             obstacles = np.vstack([self._when_landing(order, i, box), landed, reserved])
             found = None
-            for grasp in self.pickable(name, frozenset(order[:i])):
-                pose = self._find(area, prefer, 0.0, box, grasp, obstacles)
-                if pose is not None:
-                    found = Placement(grasp=grasp, pose=pose)
+            for choice in self.choices(name, frozenset(order[:i])):
+                found = self._find(area, prefer, 0.0, box, choice, obstacles)
+                if found is not None:
                     break
             if found is None:
                 return None
@@ -232,20 +333,10 @@ class PoseBound:
         found = []
         for name in names:
             box, grasp = self.problem.boxes[name], self.grasps(name)[0]
-            x, y, _, angle = pick_target(box, grasp)
-            found.append(volumes(grasp.parts, (x, y, angle), box.bottom, 0.0, SKY)[1:])
+            angle = box.yaw + grasp.axis * math.pi / 2
+            pose = (*box.position[:2], angle)
+            found.append(volumes(grasp.parts, pose, box.bottom, 0.0, SKY)[1:])
         return found
-
-
-def interval(
-    base: tuple[float, float, float], bottom: float, box: Box, grasp: Grasp
-) -> tuple[float, float]:
-    """Reach (near, far) for holding the box with its underside at this height, liftably, m."""
-    z = bottom + box.size[2] / 2 + grasp.above - base[2]
-    # Heights in whole millimetres, to compute each once; REACH_MARGIN covers the rest.
-    near, far = reach_interval(round(z, 3))
-    near_up, far_up = reach_interval(round(z + LIFT, 3))
-    return max(near, near_up) + REACH_MARGIN, min(far, far_up) - REACH_MARGIN
 
 
 def moved_box(box: Box, place: Placement) -> Box:
@@ -255,31 +346,42 @@ def moved_box(box: Box, place: Placement) -> Box:
     return replace(box, position=(x, y, box.size[2] / 2), yaw=yaw, on=None)
 
 
+def _turned(parts: np.ndarray) -> np.ndarray:
+    """The parts of a grasp (5, 5) turned by half a turn about the box."""
+    turned = parts.copy()
+    turned[:, 1] *= -1  # along the finger axis they come in pairs
+    return turned
+
+
 def _underside(rows: np.ndarray) -> np.ndarray:
     """Heights of the undersides of obstacle rows, m."""
     return rows[:, 2] - rows[:, 6]
 
 
 @njit(cache=True)
-def pick_blockers(i, axis, parts, obstacles, blocking):
-    """Fill blocking (N,) bool: which boxes are in the way of taking box i with this grasp.
+def pick_blockers(i, axes, parts, obstacles, blocking):
+    """Fill blocking (G, N) bool: which boxes are in the way of taking box i with each grasp.
 
-    obstacles (N, UPRIGHT): all the boxes. Returns how close the closest decision was, m.
+    axes (G,), parts (G, 5, 5): of the grasps. obstacles (N, UPRIGHT): all the boxes. Returns how
+    close the closest decision of each grasp was, (G,), m.
     """
-    closest = 1.0
+    closest = np.ones(len(axes))
     o = obstacles[i]
-    angle = o[3] + axis * math.pi / 2
     bottom, top = o[2] - o[6], o[2] + o[6]
     for k in range(len(obstacles)):
         other = obstacles[k : k + 1]
-        blocking[k] = False
-        if k == i:
-            continue
-        gap = clearance(o[0], o[1], angle, bottom, parts[1:], other) - PICK_MARGIN
-        if other[0, 2] - other[0, 6] >= top - 2e-3:  # what overhangs the box blocks the way up
-            gap = min(gap, clearance(o[0], o[1], angle, top, parts[:1], other))
-        blocking[k] = gap < 0
-        closest = min(closest, abs(gap))
+        dx, dy = o[0] - other[0, 0], o[1] - other[0, 1]
+        apart = math.sqrt(dx * dx + dy * dy) - o[7] - other[0, 7]
+        for g in range(len(axes)):
+            blocking[g, k] = False
+            if k == i or apart > HAND_REACH:
+                continue
+            angle = o[3] + axes[g] * math.pi / 2
+            gap = clearance(o[0], o[1], angle, bottom, parts[g, 1:], other) - PICK_MARGIN
+            if other[0, 2] - other[0, 6] >= top - 2e-3:  # what overhangs blocks the way up
+                gap = min(gap, clearance(o[0], o[1], angle, top, parts[g, :1], other))
+            blocking[g, k] = gap < 0
+            closest[g] = min(closest[g], abs(gap))
     return closest
 
 
@@ -289,8 +391,9 @@ def clearance(x, y, angle, bottom, parts, obstacles):
     best = 1.0
     c, s = math.cos(angle), math.sin(angle)
     for i in range(len(parts)):
-        offset, along, across, under = parts[i, 0], parts[i, 1], parts[i, 2], parts[i, 3]
-        px, py = x + c * offset, y + s * offset
+        offset, left = parts[i, 0], parts[i, 1]
+        along, across, under = parts[i, 2], parts[i, 3], parts[i, 4]
+        px, py = x + c * offset - s * left, y + s * offset + c * left
         radius = math.sqrt(along * along + across * across)
         for k in range(len(obstacles)):
             o = obstacles[k]
@@ -312,44 +415,68 @@ def volumes(parts, pose, bottom, top, sky):
     rows = np.empty((len(parts), UPRIGHT))
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(len(parts)):
-        low, high = bottom + parts[i, 3], top if i == 0 else sky
-        x, y = pose[0] + c * parts[i, 0], pose[1] + s * parts[i, 0]
+        low, high = bottom + parts[i, 4], top if i == 0 else sky
+        x = pose[0] + c * parts[i, 0] - s * parts[i, 1]
+        y = pose[1] + s * parts[i, 0] + c * parts[i, 1]
         upright(
-            x, y, (low + high) / 2, pose[2], parts[i, 1], parts[i, 2], (high - low) / 2, rows[i]
+            x, y, (low + high) / 2, pose[2], parts[i, 2], parts[i, 3], (high - low) / 2, rows[i]
         )
     return rows
 
 
 @njit(cache=True)
-def slack(x, y, angle, bottom, parts, obstacles, table, base, near, far):
-    """How well (x, y, angle) satisfies clearance, table edge and reach; feasible iff >= 0. m."""
+def slack(x, y, angle, bottom, parts, obstacles, table, base, near, far, enough):
+    """How well (x, y, angle) satisfies clearance, table edge and reach; feasible iff >= 0. m.
+
+    parts (V, 5, 5), near and far (V,): of the ways in which the hand may hold the box; the best
+    counts. Below `-enough` it is not computed to the end. Returns (slack, which way).
+    """
     c, s = abs(math.cos(angle)), abs(math.sin(angle))
-    along, across = parts[0, 1], parts[0, 2]
-    worst = table[0] - abs(x) - c * along - s * across
-    worst = min(worst, table[1] - abs(y) - s * along - c * across)
+    along, across = parts[0, 0, 2], parts[0, 0, 3]
+    shared = table[0] - abs(x) - c * along - s * across
+    shared = min(shared, table[1] - abs(y) - s * along - c * across)
     r = math.sqrt((x - base[0]) ** 2 + (y - base[1]) ** 2)
-    worst = min(worst, min(far - r, r - near))
-    if worst < -0.2:
-        return worst
-    return min(worst, clearance(x, y, angle, bottom, parts, obstacles) - MARGIN)
+    if shared < -0.2:
+        return shared, 0
+    shared = min(shared, clearance(x, y, angle, bottom, parts[0, :1], obstacles) - MARGIN)
+    if shared < -enough:
+        return shared, 0
+    best, which = -1.0, 0
+    for v in range(len(parts)):
+        worst = min(shared, min(far[v] - r, r - near[v]))
+        if worst > best:
+            hand = clearance(x, y, angle, bottom, parts[v, 1:], obstacles) - MARGIN
+            worst = min(worst, hand)
+            if worst > best:
+                best, which = worst, v
+        if best >= COMFORT or best >= shared:
+            break
+    return best, which
 
 
 @njit(cache=True)
 def find_pose(region, prefer, bottom, parts, obstacles, table, base, near, far, ease, pose):
     """Branch and bound for a free pose whose centre lies in a rectangle.
 
-    region: centre x, y, angle, half extents (5,). prefer (x, y): where to look first. ease: how
-    much every constraint is relaxed, m. Fills pose (x, y, angle of the finger axis) with the
-    first comfortable pose of the coarsest level that has a free one, or the clearest of that
-    level. Returns (FOUND | NONE | UNDECIDED, the slack of the best pose seen, m).
+    region: centre x, y, angle, half extents (5,). prefer (x, y): where to look first. parts,
+    near, far: as `slack` has them. ease: how much every constraint is relaxed, m. Fills pose
+    (x, y, angle of the finger axis, which of the parts) with the first comfortable pose of the
+    coarsest level that has a free one, or the clearest of that level.
+    Returns (FOUND | NONE | UNDECIDED, the slack of the best pose seen, m).
     """
     a, b = region[3], region[4]
     c, s = math.cos(region[2]), math.sin(region[2])
     nx, ny, na = max(1, math.ceil(a / 0.025)), max(1, math.ceil(b / 0.025)), 6
     hx, hy, ha = a / nx, b / ny, math.pi / (2 * na)
     spin = 0.0
-    for i in range(len(parts)):
-        spin = max(spin, abs(parts[i, 0]) + math.sqrt(parts[i, 1] ** 2 + parts[i, 2] ** 2))
+    for v in range(len(parts)):
+        for i in range(parts.shape[1]):
+            offset, left = abs(parts[v, i, 0]), abs(parts[v, i, 1])
+            if left == 0.0:
+                reach = offset + math.sqrt(parts[v, i, 2] ** 2 + parts[v, i, 3] ** 2)
+            else:
+                reach = math.sqrt((offset + parts[v, i, 2]) ** 2 + (left + parts[v, i, 3]) ** 2)
+            spin = max(spin, reach)
     count = nx * ny * na
     cells = np.empty((count, 3))
     key = np.empty(count)
@@ -373,14 +500,17 @@ def find_pose(region, prefer, bottom, parts, obstacles, table, base, near, far, 
         for n in range(len(cells)):
             x = region[0] + c * cells[n, 0] - s * cells[n, 1]
             y = region[1] + s * cells[n, 0] + c * cells[n, 1]
-            value = slack(x, y, cells[n, 2], bottom, parts, obstacles, table, base, near, far)
+            value, which = slack(
+                x, y, cells[n, 2], bottom, parts, obstacles, table, base, near, far,
+                lipschitz + ease,
+            )  # fmt: skip
             value += ease
             evaluations += 1
             keep[n] = value + lipschitz >= 0
             if value > best:
                 best = value
                 if value >= 0:
-                    pose[0], pose[1], pose[2] = x, y, cells[n, 2]
+                    pose[0], pose[1], pose[2], pose[3] = x, y, cells[n, 2], which
             if best >= COMFORT:
                 break
         if best >= 0:

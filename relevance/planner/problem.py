@@ -16,11 +16,13 @@ from relevance.planner import logic
 from relevance.planner.kernels.kinematics import Arm, arm_at
 from relevance.planner.result import Counts, Seconds
 from relevance.robot import panda
-from relevance.scene import Box, Goal, Scene
+from relevance.scene import Box, Goal, Scene, footprint_gap
 from relevance.scene.geometry import UPRIGHT, upright
 
 REGION_MARGIN = 0.0005
 """How far inside the goal region a subject is placed, m."""
+LOW = 0.2
+"""Height over the robot's base below which only the hand and the forearm can be, m."""
 CLOSE = 2e-4
 """A decision that turns over when something stands this much elsewhere is a close one, m."""
 
@@ -36,6 +38,8 @@ class Problem:
     undecided: bool = False
     """Whether a pose bound was left open on the way, or decided by less than CLOSE: the row is
     flagged ambiguous."""
+    open: set[str] = field(default_factory=set)
+    """What the bounds were asked and could not decide."""
     boxes: dict[str, Box] = field(init=False)
     index: dict[str, int] = field(init=False)
     above: dict[str, frozenset[str]] = field(init=False)
@@ -44,15 +48,23 @@ class Problem:
     """(2,) half extents, m."""
     obstacles: np.ndarray = field(init=False)
     """(N + 2, UPRIGHT): the boxes as they stand at first, then the table and the robot's foot."""
+    tall: bool = field(init=False)
+    """Whether a box is so high that it could meet the links near the base."""
     arm: Arm = field(init=False)
+    whole_arm: Arm = field(init=False)
+    """The same with the links near the base."""
 
     def __post_init__(self) -> None:
         self.boxes = {box.name: box for box in self.scene.objects}
         self.index = {name: i for i, name in enumerate(self.boxes)}
-        self.arm = arm_at(np.array([*self.scene.robot.base, self.scene.robot.yaw]))
+        base = np.array([*self.scene.robot.base, self.scene.robot.yaw])
+        self.arm, self.whole_arm = arm_at(base), arm_at(base, upper=True)
         self.table = np.array(self.scene.table.size) / 2
         standing = [obstacle(box) for box in self.scene.objects]
+        self._unsink(np.array(standing), standing)
         self.obstacles = np.array([*standing, *self._fixtures()])
+        tops = [box.top for box in self.scene.objects]
+        self.tall = max(tops) - self.scene.robot.base[2] > LOW
         self.above = logic.stacked_on(self.scene)
 
     @property
@@ -64,6 +76,19 @@ class Problem:
     def reference(self) -> Box:
         """What the goal relates it to, where it stands at first."""
         return self.boxes[self.goal.reference]
+
+    def _unsink(self, rows: np.ndarray, standing: list[np.ndarray]) -> None:
+        """Shrink boxes that are sunk into others (a scene may have that, up to a millimetre), so
+        that they only touch."""
+        apart = np.hypot(*(rows[:, None, :2] - rows[None, :, :2]).transpose(2, 0, 1))
+        beside = apart < rows[:, None, 7] + rows[None, :, 7]
+        heights = rows[:, None, 6] + rows[None, :, 6] - 1e-3  # what stands on another is not beside
+        beside &= np.abs(rows[:, None, 2] - rows[None, :, 2]) < heights
+        for i, k in zip(*np.nonzero(np.triu(beside, 1)), strict=True):
+            sunk = -footprint_gap(self.scene.objects[i], self.scene.objects[k])
+            for row in (standing[i], standing[k]) if sunk > 0 else ():
+                x, y, z, yaw, hx, hy, hz = row[:7]
+                upright(x, y, z, yaw, max(hx - sunk, 1e-4), max(hy - sunk, 1e-4), hz, row)
 
     def _fixtures(self) -> list[np.ndarray]:
         """What always stands there, as obstacles: the table and the robot's foot."""

@@ -21,7 +21,7 @@ from relevance.scene import Action, Goal, Phase, Pose, Scene, SceneError
 if TYPE_CHECKING:  # it imports pybullet, which planning does without
     from relevance.simulation import Replay
 
-PLANNER_VERSION = "4"
+PLANNER_VERSION = "5"
 Status = Literal["solved", "infeasible", "limit", "refused"]
 """`refused`: a plan was found, and the replay in the simulator does not confirm it."""
 
@@ -65,6 +65,10 @@ class PlanResult:
     goal: Goal
     status: Status
     reason: str = ""
+    """Why there is no plan, or which limit ended the search."""
+    blocking: tuple[str, ...] = ()
+    """A smallest set of objects without which the subject could be taken and put there, as far
+    as the pose bound can tell; only where there is no plan."""
     actions: tuple[Action, ...] = ()
     moved: tuple[str, ...] = ()
     """Moved objects, in order."""

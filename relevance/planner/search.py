@@ -18,16 +18,17 @@ import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
-from itertools import chain, islice
+from itertools import islice
 
 from relevance.planner import logic
+from relevance.planner.checking import broken
+from relevance.planner.grasps import fits, grasps
 from relevance.planner.guides import Guide, ask, rounds
 from relevance.planner.keyframes import KeyframeBound
 from relevance.planner.path import Motion, PathBound
 from relevance.planner.pose import PoseBound
 from relevance.planner.problem import Problem
 from relevance.planner.result import (
-    PLANNERS,
     Counts,
     PlannerConfig,
     PlanResult,
@@ -38,6 +39,8 @@ from relevance.planner.result import (
 )
 from relevance.scene import Box, Goal, Scene, footprint_gap, goal_holds
 
+TRIES = 200
+"""How many sets are looked at to say what stands in the way."""
 ORDERS = 6
 """How many orders of a set `informed` tries."""
 COST_TOLERANCE = 1e-3
@@ -99,9 +102,11 @@ def _plan(
         if budget <= 0:
             break
     result = _Search(bounds, config, last, todo.scores, config.node_limit).run(began)
-    if result.status == "infeasible" and guide is not None and last != everything:
+    hopeless = result.status == "infeasible" and not result.blocking
+    if result.status != "solved" and guide is not None and last != everything and not hopeless:
         kept = ", ".join(name for name in scene.names if name in last)
-        result = replace(result, reason=f"none that moves only what was kept ({kept})")
+        reason = f"none that moves only what was kept ({kept}): {result.reason}"
+        result = replace(result, reason=reason)
     return result
 
 
@@ -132,9 +137,6 @@ class Ours:
         return plan(scene, goal, config=config, guide=guide, movable=movable, replay=replay)
 
 
-PLANNERS.register(Ours.name, Ours())
-
-
 @cache
 def warm_up() -> None:
     """Compile the solvers now (once a process), so that no plan's time includes it."""
@@ -152,7 +154,7 @@ class _Bounds:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.pose = PoseBound(problem)
-        self.keyframes = KeyframeBound(problem)
+        self.keyframes = KeyframeBound(self.pose)
         self.path = PathBound(problem)
 
 
@@ -174,24 +176,34 @@ class _Search:
         if scores is not None:
             self.order.sort(key=lambda n: -scores[n])
         self.limit = problem.counts.nodes + limit
-        self.reason = ""
         self.refused_late = False
+        self.stuck = frozenset[str]()
+        """What can never be picked."""
+        self.late = False
+        """Whether the last set passed all relaxations, and failed after."""
+        self.cut = False
+        """Whether plans of more actions than allowed were left untried."""
 
     def run(self, began: float) -> PlanResult:
         problem, goal = self.problem, self.problem.goal
-        self.reason = self._hopeless()
         found: list[Motion] = []
-        status: Status = "infeasible"
-        if not self.reason:
-            self.reason = f"no plan of up to {self.config.max_actions} actions"
+        status, reason, blocking = self._hopeless()
+        if status is None:
             try:
                 found = self._plans()
             except _Limit:
-                status, self.reason = "limit", f"node limit {self.config.node_limit} reached"
+                status, reason = "limit", f"node limit: {self.config.node_limit} nodes were opened"
+            if not found:
+                blocking = self._blocking()
+                if status is None:
+                    undecided = self.cut or problem.open
+                    status = "limit" if undecided and self._might() else "infeasible"
+                reason = reason or self._exhausted(status, blocking)
         problem.seconds.total = time.process_time() - began
         if not found:
+            assert status is not None
             return PlanResult(
-                goal=goal, status=status, reason=self.reason, final={},
+                goal=goal, status=status, reason=reason, blocking=blocking, final={},
                 ambiguous=problem.undecided or self.refused_late, counts=problem.counts,
                 seconds=problem.seconds,
             )  # fmt: skip
@@ -218,25 +230,97 @@ class _Search:
         problem = self.problem
         return round(motion.cost / COST_TOLERANCE), [problem.index[n] for n in motion.order]
 
-    def _hopeless(self) -> str:
-        """Why no sequence can work even if everything else were gone; empty if one might."""
-        goal = self.problem.goal
+    def _hopeless(self) -> tuple[Status | None, str, tuple[str, ...]]:
+        """Why no sequence can work even if everything else were gone; no status if one might."""
+        goal, problem = self.problem.goal, self.problem
         if goal.subject not in self.allowed:
-            return f"{goal.subject} may not be moved"
+            return "infeasible", f"{goal.subject} may not be moved", (goal.subject,)
         if not self.pose.grasps(goal.subject):
-            return f"{goal.subject} cannot be grasped: too wide for the hand or out of reach"
+            why = self._why_not(goal.subject)
+            return "infeasible", f"{goal.subject} cannot be grasped: {why}", ()
         if not (self._within_reach() or self._reference_moves()):
-            return "the goal region is out of reach, off the table or too tight for the hand"
-        return ""
+            reason = "the goal region is out of reach, off the table or too tight for the hand"
+            return ("limit" if problem.open else "infeasible"), reason, ()
+        return None, "", ()
+
+    def _might(self) -> bool:
+        """Whether a plan is possible once all that can leave has left, or the reference moves."""
+        problem, goal = self.problem, self.problem.goal
+        gone = frozenset(self.order) - self.stuck - {goal.subject, goal.reference}
+        return self._reference_moves() or (
+            self.pose.pickable(goal.subject, gone)
+            and (any(self.pose.goal_poses(gone, problem.reference)) or bool(problem.open))
+        )
+
+    def _stuck(self) -> frozenset[str]:
+        """What can never be picked: it cannot be grasped, or carries what does not leave first."""
+        stays = set(self.problem.boxes) - self.allowed | {self.problem.goal.subject}
+        stays |= {name for name in self.allowed if not self.pose.grasps(name)}
+        return frozenset(name for name in self.allowed if self._carried_by(name) & stays) | stays
+
+    def _exhausted(self, status: Status, blocking: tuple[str, ...]) -> str:
+        """Why the search ended without a plan, in the words of the task."""
+        goal, problem = self.problem.goal, self.problem
+        said = []
+        if blocking:
+            said.append(f"{', '.join(blocking)} would have to leave first")
+            for name in blocking:
+                if name not in self.allowed:
+                    said.append(f"{name} may not be moved")
+                elif goal.subject in self._carried_by(name):
+                    said.append(
+                        f"{goal.subject} stands on {name} and would have to move twice, "
+                        "while a plan moves each object once"
+                    )
+                elif not self.pose.grasps(name):
+                    said.append(f"{name} cannot be grasped: {self._why_not(name)}")
+        if self.cut and status == "limit":
+            said.append(f"max_actions: no plan of up to {self.config.max_actions} actions")
+        if status == "limit":
+            said += [f"undecided: {what}" for what in sorted(problem.open)]
+        return "; ".join(said) or "nothing that may be moved would help"
+
+    def _carried_by(self, name: str) -> frozenset[str]:
+        """All that stands on an object, over others too."""
+        found, above = frozenset(), self.problem.above[name]
+        while not above <= found:
+            found |= above
+            above = frozenset().union(*(self.problem.above[other] for other in found))
+        return found
+
+    def _blocking(self) -> tuple[str, ...]:
+        """A smallest set without which the subject could be taken and put down; the first that
+        is found within TRIES, empty if none is."""
+        problem, near, tries = self.problem, self._beside_goal(), 0
+        goal, frontier = problem.goal, [frozenset[str]()]
+        while frontier:
+            following: dict[frozenset[str], None] = {}
+            for gone in frontier:
+                tries += 1
+                if tries > TRIES:
+                    return ()
+                if self.pose.pickable(goal.subject, gone) and any(
+                    self.pose.goal_poses(gone, problem.reference)
+                ):
+                    return tuple(name for name in problem.boxes if name in gone)
+                helpful = (near | self.pose.in_the_way(goal.subject)) - gone
+                for name in sorted(helpful - {goal.subject, goal.reference}):
+                    following[gone | {name}] = None
+            frontier = list(following)
+        return ()
+
+    def _why_not(self, name: str) -> str:
+        """Why an object cannot be grasped wherever the others are."""
+        box = self.problem.boxes[name]
+        if grasps(box):
+            return "out of reach"
+        return "too low for the fingers" if fits(box) else "too wide for the hand"
 
     def _within_reach(self) -> bool:
         """Whether the goal region has room for the subject where the reference stands."""
         problem, goal = self.problem, self.problem.goal
         others = frozenset(problem.boxes) - {goal.subject, goal.reference}
-        return any(
-            self.pose.goal_pose(others, grasp, problem.boxes[goal.reference]) is not None
-            for grasp in self.pose.grasps(goal.subject)
-        )
+        return any(self.pose.goal_poses(others, problem.reference, everywhere=True))
 
     def _reference_moves(self) -> bool:
         reference = self.problem.goal.reference
@@ -254,11 +338,13 @@ class _Search:
         The reference is a landmark: sequences that move it count only when no other does it.
         """
         reference, found = self.problem.goal.reference, []
+        self.stuck = self._stuck()
+        movable = [name for name in self.order if name not in self.stuck]
         levels = self._sequences if self.config.search == "tree" else self._sets
         if self._within_reach():
-            found = levels([name for name in self.order if name != reference], frozenset())
+            found = levels([name for name in movable if name != reference], frozenset())
         if not found and self._reference_moves():
-            found = levels(self.order, frozenset({reference}))
+            found = levels(movable, frozenset({reference}))
         return found
 
     def _sequences(self, movable: list[str], required: frozenset[str]) -> list[Motion]:
@@ -285,29 +371,46 @@ class _Search:
             if found:
                 return found
             frontier = following
+        self.cut |= bool(frontier)
         return []
 
     def _sets(self, movable: list[str], required: frozenset[str]) -> list[Motion]:
         """Breadth-first over sets of objects moved before the subject, grown by what could help."""
         subject, near = self.problem.goal.subject, self._beside_goal()
         rank = {name: i for i, name in enumerate(movable) if name != subject}
-        frontier: list[frozenset[str]] = [frozenset()]
+        frontier, rest = [frozenset[str]()], list[frozenset[str]]()
         for _ in range(self.config.max_actions // 2):
-            found, following = [], set()
-            for chosen in frontier:
+            found, following, others = [], set(), set()
+            for chosen in self._tiers(frontier, rest, found):
                 self._visit()
+                self.late = False
                 if required <= chosen:
-                    motion = self._finish(chosen, islice(self._orders(chosen), ORDERS))
+                    motion = self._finish(chosen, self._orders(chosen))
                     if motion is not None:
                         found.append(motion)
                         if self.config.stop == "first":
                             return found
                 helpful = near | self._in_the_way(chosen)
                 following |= {chosen | {name} for name in helpful - chosen if name in rank}
+                if self.late:  # the others' leaving can make room for what is put aside
+                    others |= {chosen | {name} for name in rank if name not in chosen}
             if found:
                 return found
-            frontier = sorted(following, key=lambda names: sorted(rank[name] for name in names))
+
+            def key(names: frozenset[str]) -> list[int]:
+                return sorted(rank[name] for name in names)
+
+            frontier, rest = sorted(following, key=key), sorted(others - following, key=key)
+        self.cut |= bool(frontier or rest)
         return []
+
+    def _tiers(
+        self, first: list[frozenset[str]], rest: list[frozenset[str]], found: list[Motion]
+    ) -> Iterator[frozenset[str]]:
+        """The likely sets of a level, and the rest where none of them has given a plan."""
+        yield from first
+        if not found:
+            yield from rest
 
     def _beside_goal(self) -> frozenset[str]:
         """Objects whose leaving can make room in the goal region; and the reference."""
@@ -315,7 +418,7 @@ class _Search:
         subject, reference = problem.subject, problem.reference
         x, y, angle, a, b = problem.goal_region(reference)
         spread = max(
-            math.hypot(abs(part[0]) + part[1], part[2])
+            math.hypot(abs(part[0]) + part[2], part[3])
             for grasp in self.pose.grasps(subject.name)
             for part in grasp.parts
         )
@@ -331,11 +434,9 @@ class _Search:
 
     def _in_the_way(self, chosen: frozenset[str]) -> frozenset[str]:
         """What blocks the picks that a set needs: the subject's by any grasp, and its own."""
-        problem, goal = self.problem, self.problem.goal
+        goal = self.problem.goal
         needed = [goal.subject, *(n for n in chosen if not self.pose.pickable(n, chosen))]
-        blockers = [self.pose.blockers(name).values() for name in needed]
-        above = [problem.above[name] for name in needed]
-        return frozenset().union(*above, *chain.from_iterable(blockers)) - {goal.subject}
+        return frozenset().union(*map(self.pose.in_the_way, needed)) - {goal.subject}
 
     def _orders(self, chosen: frozenset[str]) -> Iterator[tuple[str, ...]]:
         """The orders in which a set can be picked; scores have no say in it."""
@@ -353,28 +454,31 @@ class _Search:
     def _finish(self, gone: frozenset[str], prefixes: Iterable[tuple[str, ...]]) -> Motion | None:
         """Pick the subject once `gone` have left and place it at the goal: all bounds in turn."""
         problem, goal = self.problem, self.problem.goal
-        options = self.pose.pickable(goal.subject, gone)
-        if goal.reference not in gone:
-            reference = problem.boxes[goal.reference]
-            options = tuple(
-                grasp
-                for grasp in options
-                if self.pose.goal_pose(gone, grasp, reference) is not None
-            )
-        if not options:
+        if not self.pose.pickable(goal.subject, gone):
+            return None
+        reference = problem.reference
+        if reference.name not in gone and not any(self.pose.goal_poses(gone, reference)):
             return None
         self._visit()
-        for prefix in prefixes:
+        self.late = True
+        prefixes = iter(prefixes)
+        for prefix in islice(prefixes, ORDERS):
             order = (*prefix, goal.subject)
-            for grasp in options:
-                placements = self.pose.place_all(order, grasp)
-                if placements is None:
-                    problem.undecided = True
-                    continue
+            tried = False
+            for placements in self.pose.place_all(order):
+                tried = True
                 solved = self.bounds.keyframes.solve(order, placements)
-                if solved is not None:
+                if solved is None:
+                    problem.open.add("whether the arm reaches all switches at once")
+                else:
                     motion = self.bounds.path.solve(order, placements, *solved)
-                    if motion is not None:
+                    if motion is not None and not broken(problem, motion):
                         return motion
+                    problem.open.add("whether there is a motion between the switches")
                 self.refused_late = True
+            if not tried:
+                problem.undecided = True
+                problem.open.add("where to put what is in the way")
+        if next(prefixes, None) is not None:
+            problem.open.add(f"more than {ORDERS} orders of one set")
         return None

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from relevance.planner.kernels.native import Native, call, load
-from relevance.robot import ARM, HAND, LINKS, panda
+from relevance.robot import ARM, HAND, LINKS, UPPER_LINKS, panda
 
 FRAME = 54
 """Numbers a frame takes in the output of `frames`: p (3), R (9), Jv (21), Jw (21), row-major."""
@@ -28,6 +28,8 @@ class Functions(NamedTuple):
 
     frames: Native
     """x = (q (7), base (4)); y = a frame of FRAME numbers for each of LINKS."""
+    all_frames: Native
+    """The same for LINKS and UPPER_LINKS."""
     grasp: Native
     """x = (q (7), base (4), target (4)); y = residual (6), d/dq (6 x 7), d/dtarget (6 x 4)."""
 
@@ -49,9 +51,10 @@ class Arm(NamedTuple):
     grasp_f: np.ndarray
 
 
-def arm_at(base: np.ndarray) -> Arm:
-    """The Panda at a base (x, y, z, yaw)."""
-    arm, (frames, grasp) = panda(), functions()
+def arm_at(base: np.ndarray, *, upper: bool = False) -> Arm:
+    """The Panda at a base (x, y, z, yaw); upper: with the frames of the links near the base."""
+    arm, (few, every, grasp) = panda(), functions()
+    frames = every if upper else few
     return Arm(
         base, arm.lower + LIMIT_MARGIN, arm.upper - LIMIT_MARGIN, arm.velocity, frames.x, frames.y,
         frames.handle, grasp.x, grasp.y, grasp.handle,
@@ -85,6 +88,12 @@ def finger_turn(arm, q0, q1):
 
 
 @njit(cache=True)
+def finger_way(arm, q, angle):
+    """1 where the hand's y points along this angle (rad) at q, -1 where against it."""
+    return 1.0 if math.cos(_finger_angle(arm, q) - angle) > 0 else -1.0
+
+
+@njit(cache=True)
 def _finger_angle(arm, q):
     look_at_frames(arm, q)
     axis = HAND * FRAME + 3 + 1
@@ -108,15 +117,20 @@ def functions() -> Functions:
             axes.append((T[:3, 2], T[:3, 3]))
         T_world[joint.child] = (T, len(axes))
 
-    parts = []
-    for name in LINKS:
-        T, moved_by = T_world[name]
-        Jv, Jw = ca.SX.zeros(3, ARM), ca.SX.zeros(3, ARM)
-        for i, (axis, origin) in enumerate(axes[:moved_by]):
-            Jv[:, i] = ca.cross(axis, T[:3, 3] - origin)
-            Jw[:, i] = axis
-        parts += [T[:3, 3], ca.vec(T[:3, :3].T), ca.vec(Jv.T), ca.vec(Jw.T)]
-    frames = ca.Function("frames", [ca.vertcat(q, base)], [ca.cse(ca.densify(ca.vertcat(*parts)))])
+    def frames_of(name: str, links: tuple[str, ...]) -> ca.Function:
+        parts = []
+        for link in links:
+            T, moved_by = T_world[link]
+            Jv, Jw = ca.SX.zeros(3, ARM), ca.SX.zeros(3, ARM)
+            for i, (axis, origin) in enumerate(axes[:moved_by]):
+                Jv[:, i] = ca.cross(axis, T[:3, 3] - origin)
+                Jw[:, i] = axis
+            parts += [T[:3, 3], ca.vec(T[:3, :3].T), ca.vec(Jv.T), ca.vec(Jw.T)]
+        flat = ca.cse(ca.densify(ca.vertcat(*parts)))
+        return ca.Function(name, [ca.vertcat(q, base)], [flat])
+
+    frames = frames_of("frames", LINKS)
+    all_frames = frames_of("all_frames", (*LINKS, *UPPER_LINKS))
 
     # Switch constraint: hand at target[:3], z axis down, finger axis (y) along angle target[3]
     # up to half turns (the gripper is symmetric).
@@ -129,7 +143,7 @@ def functions() -> Functions:
         ca.vec(ca.jacobian(residual, target).T),
     )
     grasp = ca.Function("grasp", [ca.vertcat(q, base, target)], [ca.cse(ca.densify(flat))])
-    return Functions(*load([frames, grasp]))
+    return Functions(*load([frames, all_frames, grasp]))
 
 
 def _about_z(angle):
@@ -145,9 +159,10 @@ _A1, _A2 = math.atan2(_OFFSET, _UPPER), math.atan2(_OFFSET, _FORE)
 
 
 @njit(cache=True)
-def hand_down(target, base, lower, upper, q):
+def hand_down(target, base, lower, upper, q, way=0.0):
     """Fill q (7,) with the planar solution for a hand target (x, y, z, finger angle).
 
+    way: 1 or -1 for the hand's y along or against the finger angle, 0 for what turns least.
     Returns whether it exists within the joint limits.
     """
     c, s = math.cos(base[3]), math.sin(base[3])
@@ -168,7 +183,11 @@ def hand_down(target, base, lower, upper, q):
     q[4] = 0.0
     q[5] = q[1] - q[3]
     turn = math.pi / 2 + q[0] - (target[3] - base[3])
-    q[6] = math.pi / 4 + turn - math.pi * math.floor(turn / math.pi + 0.5)
+    if way == 0.0:
+        q[6] = math.pi / 4 + turn - math.pi * math.floor(turn / math.pi + 0.5)
+    else:  # the limits are not far from half a turn to both sides
+        q[6] = math.pi / 4 + turn + (0.0 if way > 0 else math.pi)
+        q[6] -= 2 * math.pi * math.floor(q[6] / (2 * math.pi) + 0.5)
     return (q >= lower).all() and (q <= upper).all()
 
 

@@ -35,9 +35,8 @@ from pydantic import Field
 from relevance.configs import config
 from relevance.errors import RelevanceError
 from relevance.planner.guides import Guide, ask, rounds
-from relevance.planner.path import SPEED, STEP
+from relevance.planner.kernels.rows import SPEED, STEP
 from relevance.planner.result import (
-    PLANNERS,
     Counts,
     PlanResult,
     Seconds,
@@ -217,9 +216,6 @@ class Rai:
     ) -> PlanResult:
         """As `plan_rai`."""
         return plan_rai(scene, goal, config=config, guide=guide, movable=movable, replay=replay)
-
-
-PLANNERS.register(Rai.name, Rai())
 
 
 @dataclass(slots=True, kw_only=True)

@@ -1,0 +1,174 @@
+"""Grasps as a family, and a planner whose `infeasible` means it."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from relevance.planner import PlannerConfig, plan, trajectory
+from relevance.planner.checking import broken
+from relevance.planner.grasps import FARTHEST, GRIP, GROUND, INSET, grasps, other_grasps
+from relevance.planner.path import Motion
+from relevance.planner.problem import Problem
+from relevance.scene import Scene, scene_from_json
+from tests.planning import BLUE, GREY, OPEN, RED, box
+
+HAND_1 = scene_from_json(
+    json.dumps(
+        {
+            "objects": [
+                {"name": "b0", "size": [0.0949, 0.0496, 0.0487], "yaw": -1.886696,
+                 "position": [-0.0267, -0.2589, 0.02435], "color": [0.1, 0.45, 0.96]},
+                {"name": "b1", "size": [0.1, 0.1139, 0.1045], "yaw": -2.641596,
+                 "position": [-0.0747, -0.1506, 0.05225], "color": [0.1, 0.96, 0.45]},
+                {"name": "b2", "size": [0.0672, 0.0802, 0.0922], "yaw": -1.276396,
+                 "position": [-0.0883, -0.2039, 0.1506], "color": [0.66, 0.84, 0.01], "on": "b1"},
+                {"name": "b3", "size": [0.1084, 0.0579, 0.051], "yaw": -2.580596,
+                 "position": [0.0025, 0.0741, 0.0255], "color": [0.66, 0.01, 0.84]},
+                {"name": "b4", "size": [0.0807, 0.0504, 0.0952], "yaw": -2.353296,
+                 "position": [-0.0789, 0.1366, 0.0476], "color": [1.0, 0.25, 0.25]},
+            ]
+        }
+    )
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("search", ["tree", "informed"])
+def test_what_one_fixed_grasp_cannot_take_is_solved(search):
+    result = plan(HAND_1, "on(b0, b1)", config=PlannerConfig(search=search))
+    assert result.status == "solved"
+    assert result.moved == ("b2", "b0")
+
+
+@pytest.mark.parametrize("height", [0.01, 0.012, 0.015, 0.018])
+def test_low_boxes_are_taken(height):
+    tray = box("tray", 0.0, -0.3, RED, size=(0.05, 0.05, height))
+    scene = Scene(objects=(tray, box("block", 0.0, 0.0, BLUE)))
+    assert plan(scene, "on(tray, block)").status == "solved"
+
+
+def test_what_is_too_low_for_the_fingers_is_infeasible():
+    tray = box("tray", 0.0, -0.3, RED, size=(0.05, 0.05, 0.005))
+    scene = Scene(objects=(tray, box("block", 0.0, 0.0, BLUE)))
+    result = plan(scene, "on(tray, block)")
+    assert result.status == "infeasible"
+    assert result.reason == "tray cannot be grasped: too low for the fingers"
+
+
+def test_thin_pads_mark_places():
+    pad = box("pad", 0.0, 0.0, BLUE, size=(0.12, 0.12, 0.002))
+    scene = Scene(objects=(pad, box("cube", 0.0, -0.3, RED)))
+    assert plan(scene, "on(cube, pad)").status == "solved"
+
+
+def test_every_hold_is_sound():
+    rng = np.random.default_rng(1)
+    count = 0
+    for _ in range(200):
+        size = tuple(rng.uniform(0.008, 0.12, 3))
+        one = box("b", 0.0, 0.0, size=size)
+        deep = grasps(one)
+        for grasp in (*deep, *other_grasps(one).grasps):
+            count += 1
+            assert GRIP <= grasp.depth <= size[2] - GROUND + 1e-9
+            assert abs(grasp.shift) <= max(size[1 - grasp.axis] / 2 - INSET, 0.0) + 1e-9
+            assert abs(grasp.shift) <= FARTHEST
+            assert grasp.price >= 0
+            assert (grasp.price == 0) == (grasp in deep)
+    assert count > 1000
+
+
+def test_deep_and_centred_is_preferred():
+    result = plan(OPEN, "on(red, blue)")
+    hold = grasps(OPEN["red"])[0]
+    problem = Problem(OPEN, result.goal)
+    q = result.phases[0].q[-1]
+    from relevance.planner.checking import _held
+
+    centre, _ = _held(problem, "red", q)
+    np.testing.assert_allclose(centre, [0.0, 0.0, hold.above], atol=1e-3)
+
+
+def test_a_full_turn_of_yaw_changes_nothing():
+    wall = box("grey", 0.0, -0.06, GREY, size=(0.12, 0.06, 0.08))
+    here = Scene(objects=(*OPEN.objects, wall))
+    turned = replace(
+        here, id="", objects=tuple(replace(b, yaw=b.yaw + 2 * math.pi) for b in here.objects)
+    )
+    a, b = (plan(scene, "on-the-left(red, blue)", replay=False) for scene in (here, turned))
+    assert (a.status, a.moved) == (b.status, b.moved)
+
+
+def test_a_box_under_the_subject_cannot_leave_first():
+    tower = [box(f"t{i}", 0.0, 0.2, RED, size=(0.05,) * 3, bottom=0.05 * i,
+                 on=f"t{i - 1}" if i else None) for i in range(3)]  # fmt: skip
+    scene = Scene(objects=(*tower, box("x", 0.0, -0.2, BLUE)))
+    for search in ("tree", "informed"):
+        result = plan(scene, "on(t2, t0)", config=PlannerConfig(search=search))
+        assert result.status == "infeasible"
+        assert result.blocking == ("t1",)
+        assert "t2 stands on t1 and would have to move twice" in result.reason
+
+
+def test_limits_are_named():
+    wall = box("grey", 0.0, -0.06, GREY, size=(0.12, 0.06, 0.08))
+    scene = Scene(objects=(*OPEN.objects, wall))
+    result = plan(scene, "on-the-left(red, blue)", config=PlannerConfig(max_actions=2))
+    assert result.status == "limit"
+    assert result.blocking == ("grey",)
+    assert "grey would have to leave first; max_actions" in result.reason
+    result = plan(scene, "on-the-left(red, blue)", config=PlannerConfig(node_limit=2))
+    assert result.status == "limit"
+    assert "node limit" in result.reason
+
+
+def test_the_dense_check_fails_what_breaks_a_limit_or_the_goal():
+    result = plan(OPEN, "on(red, blue)", replay=False)
+    problem = Problem(OPEN, result.goal)
+    motion = Motion(
+        order=result.moved, phases=result.phases, final=result.final, cost=result.cost,
+        max_penetration=result.max_penetration,
+    )  # fmt: skip
+    assert broken(problem, motion) == ""
+    first = result.phases[0]
+    lean = np.zeros(7)
+    lean[3] = 4.0
+    bent = replace(first, q=first.q + lean)
+    assert "joint 4 exceeds" in broken(problem, replace(motion, phases=(bent,)))
+    fast = replace(first, dt=first.dt / 20)
+    assert "times its speed limit" in broken(problem, replace(motion, phases=(fast,)))
+    assert "is not true" in broken(problem, replace(motion, final={}))
+    assert "penetrated" in broken(problem, replace(motion, max_penetration=2e-3))
+
+
+def test_a_trajectory_is_the_plan():
+    result = plan(OPEN, "on(red, blue)")
+    arrays = trajectory(result)
+    count = sum(len(phase.q) for phase in result.phases)
+    assert {name: len(rows) for name, rows in arrays.items()} == dict.fromkeys(
+        ("times", "joints", "gripper", "attached"), count
+    )
+    assert (np.diff(arrays["times"]) > 0).all()
+    assert set(arrays["attached"]) == {"", "red"}
+    moves = np.abs(np.diff(arrays["joints"], axis=0)).max(axis=1)
+    assert moves[np.diff(arrays["gripper"]) != 0].max() == 0  # still while the fingers move
+    assert len(trajectory(replace(result, phases=()))["times"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("base", "yaw"),
+    [((-0.48, 0.0, 0.0), 0.4), ((0.0, -0.6, 0.0), math.pi / 2), ((0.55, 0.0, 0.0), math.pi),
+     ((-0.48, 0.0, 0.1), 0.0)],
+)  # fmt: skip
+def test_robots_stand_anywhere(base, yaw):
+    wall = box("grey", 0.0, -0.02, GREY, size=(0.12, 0.06, 0.08))
+    red, blue = box("red", 0.05, 0.15, RED), box("blue", 0.0, -0.12, BLUE)
+    robot = replace(OPEN.robot, base=base, yaw=yaw)
+    scene = Scene(objects=(red, blue, wall), robot=robot)
+    for goal in ("on(red, blue)", "in-front(red, blue)"):
+        result = plan(scene, goal)
+        assert result.status == "solved", result.reason
+        assert result.replay is not None
+        assert result.replay.ok
