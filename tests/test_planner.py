@@ -109,7 +109,7 @@ def test_a_decision_that_a_tenth_of_a_millimetre_turns_is_flagged():
         blocking, free = (blocking, middle) if beside(middle).moved == ("red",) else (middle, free)
     assert beside(blocking).ambiguous
     assert beside(free).ambiguous
-    assert not beside(blocking - 0.002).ambiguous
+    assert not beside(blocking - 0.01).ambiguous
     assert not beside(free + 0.002).ambiguous
 
 
