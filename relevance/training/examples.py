@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from relevance.models import DECIMETRE, GEOMETRY, PATCH, STRIDE, half_extents, mirrored
-from relevance.scene import PREDICATES, Camera, Predicate, Scene
+from relevance.models import GEOMETRY, PATCH, STRIDE, mirrored, true_geometry
+from relevance.scene import PREDICATES, Camera, Predicate
 from relevance.store import Dataset, DatasetError
 from relevance.training.settings import TrainConfig
 
@@ -193,15 +193,6 @@ def one_labelling(dataset: Dataset, split: str, policy: str) -> None:
                     f"{file}: made by {key} {made[key]}, expected {expected} as all labels of "
                     f"split {split}; `relevance label` finishes what was begun"
                 )
-
-
-def true_geometry(scene: Scene) -> np.ndarray:
-    """Position, size and footprint half-extents of every box, (N, GEOMETRY), decimetres."""
-    size = torch.tensor([box.size for box in scene.objects], dtype=torch.float64)
-    yaw = torch.tensor([box.yaw for box in scene.objects], dtype=torch.float64)
-    position = torch.tensor([box.position for box in scene.objects], dtype=torch.float64)
-    extents = half_extents(size[:, 0], size[:, 1], yaw)
-    return (torch.cat([position, size, extents], dim=1) / DECIMETRE).numpy().astype(np.float32)
 
 
 def _goals(items: list[tuple[int, list[int], np.ndarray, np.ndarray]], total: int) -> Goals:

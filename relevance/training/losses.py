@@ -17,7 +17,7 @@ from relevance.training.settings import TrainConfig
 
 def batch_loss(model: RelevanceModel, batch: Batch, config: TrainConfig) -> dict[str, Tensor]:
     """The loss of a batch and its parts; every scene is encoded once for all its goals."""
-    encoding = model.encode(batch.image, batch.views, batch.present)
+    encoding = model.encode(batch.image, batch.views, batch.present, batch.geometry)
     parts: dict[str, Tensor] = {}
     terms = [
         relevance_loss(

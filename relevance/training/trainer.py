@@ -242,7 +242,7 @@ def measure(model: RelevanceModel, examples: Examples, batch: int = 16) -> dict[
             for start in range(0, len(scenes), batch):
                 drawn = gather(examples, scenes[start : start + batch], [predicate])
                 drawn = drawn.to(model.device)
-                encoding = model.encode(drawn.image, drawn.views, drawn.present)
+                encoding = model.encode(drawn.image, drawn.views, drawn.present, drawn.geometry)
                 ((_, goals, relevant, labelled),) = drawn.turns
                 score = model.decode(encoding, predicate, goals)
                 places = torch.arange(score.shape[-1], device=score.device)
