@@ -51,8 +51,14 @@ class ResnetConfig(ModelConfig):
     @classmethod
     def smoke(cls) -> Self:
         """The smallest that runs."""
-        small = {"scene_channels": 8, "view_channels": 8, "width": 16, "hidden": 32}
-        return cls(scene_blocks=(1, 1), view_blocks=(1,), **small)
+        return cls(
+            scene_blocks=(1, 1),
+            scene_channels=8,
+            view_blocks=(1,),
+            view_channels=8,
+            width=16,
+            hidden=32,
+        )
 
     @classmethod
     def paper(cls) -> Self:
