@@ -341,6 +341,42 @@ def test_a_checkpoint_has_the_heads_that_it_was_trained_with(root: Path) -> None
         model.decode(encoding, "behind", goals)
 
 
+def test_one_network_for_some_predicates(root: Path) -> None:
+    """The paper's `on` has a network of its own."""
+    meta = load_checkpoint(train(root, replace(CONFIG, steps=1, predicates=("on",))))[1]
+    assert meta["predicates"] == ["on"]
+    assert set(meta["metrics"]) == {"on"}
+    shutil.rmtree(root / "labels/predicate=on")
+    for predicates in (("on", "behind"), ("behind", "above")):
+        with pytest.raises(
+            DatasetError, match=r"no labels of (on|above) with split train"
+        ) as error:
+            train(root, replace(CONFIG, steps=1, predicates=predicates))
+        assert "\n" not in str(error.value)
+
+
+def test_a_head_that_is_trained_alone_leaves_the_others_as_they_are(root: Path) -> None:
+    first = train(root, replace(CONFIG, steps=2, predicates=("in-front", "behind")))
+    later = replace(CONFIG, steps=3, predicates=("on",), start=first.stem)
+    second = train(root, later)
+    models = [load_checkpoint(path)[0] for path in (first, second)]
+    assert models[1].predicates == ("in-front", "behind", "on")
+    before, after = (model.state_dict() for model in models)
+    assert equal(before, {name: after[name] for name in before})
+    sample = next(Dataset.open(root).samples("train"))
+    image = torch.from_numpy(sample.image).permute(2, 0, 1)[None]
+    views = torch.from_numpy(sample.views).permute(0, 3, 1, 2)[None]
+    goals = torch.tensor([[[0, 1], [1, 2]]])
+    with torch.inference_mode():
+        for name in ("in-front", "behind"):
+            scores = [m.decode(m.encode(image, views), name, goals) for m in models]
+            assert torch.equal(*scores)
+    fresh = weights(train(root, replace(later, steps=1)))
+    assert not equal(after, fresh), "the new head learns"
+    with pytest.raises(CheckpointError, match=r"has a head for behind, expected new --predicates"):
+        train(root, replace(later, predicates=("behind",)))
+
+
 def test_the_newest_checkpoint_and_how_one_is_named(root: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no checkpoints there, expected `train` first"):
         newest_checkpoint(root)

@@ -31,9 +31,13 @@ from relevance.models import (
     half_extents,
     mirrored,
     model_config,
+    reasoning,
 )
+from relevance.models.geometry import GeometryConfig
 from relevance.models.glimpse import GlimpseBody, GlimpseConfig
-from relevance.models.vit import VitConfig
+from relevance.models.resnet import ResnetConfig
+from relevance.models.resnet3d import Resnet3dConfig
+from relevance.models.vit import ViTBody, VitConfig
 from relevance.scene import PREDICATES, Box, Camera, Predicate, Rectangle, Robot, project
 
 torch.set_num_threads(1)  # threads that wait for each other crawl on a busy machine
@@ -41,7 +45,14 @@ torch.set_num_threads(1)  # threads that wait for each other crawl on a busy mac
 SMALL: dict[str, ModelConfig] = {
     "glimpse": GlimpseConfig(width=32, heads=2, layers=2, channels=8),
     "vit": VitConfig(width=32, heads=2, layers=2, hidden=24),
+    "vit-trio": VitConfig(width=32, heads=2, layers=2, hidden=24, attention="trio"),
+    "vit-no-patches": VitConfig(width=32, heads=2, layers=2, hidden=24, attention="no-patches"),
+    "resnet": ResnetConfig.smoke(),
+    "resnet3d": Resnet3dConfig.smoke(),
+    "geometry": GeometryConfig.smoke(),
 }
+PAPER = [body for body in SMALL if body not in ("glimpse", "geometry")]
+"""What a score of these may see is the image and three views."""
 ALL = pytest.mark.parametrize("body", list(SMALL))
 
 
@@ -63,24 +74,77 @@ def pictures(batch: int = 2, objects: int = 5) -> tuple[torch.Tensor, torch.Tens
     return image, views
 
 
+def standing(batch: int = 2, objects: int = 5) -> torch.Tensor:
+    """Made-up poses."""
+    generator = torch.Generator().manual_seed(5)
+    return torch.rand(batch, objects, GEOMETRY, generator=generator)
+
+
 GOALS = torch.tensor([[[0, 1], [3, 2], [4, 0]], [[2, 4], [1, 0], [0, 3]]])
 
 
+@pytest.mark.parametrize("body", PAPER)
 @torch.inference_mode()
-def test_vit_shared_encoding_equals_one_encoding_a_query() -> None:
+def test_one_encoding_equals_one_a_query(body: str) -> None:
     """The paper encodes subject, reference and query anew for every query."""
-    vit = model("vit")
+    network = model(body)
     image, views = pictures()
-    encoding = vit.encode(image, views)
-    for predicate in PREDICATES.values():
-        shared = vit.decode(encoding, predicate, GOALS)
-        for b in range(2):
-            for g in range(3):
-                for query in range(5):
-                    trio = [*GOALS[b, g].tolist(), query]
-                    alone = vit.encode(image[b : b + 1], views[b : b + 1, trio])
-                    score = vit.decode(alone, predicate, torch.tensor([[[0, 1]]]))[0, 0, 2]
-                    assert abs(score - shared[b, g, query]) < 1e-5
+    encoding = network.encode(image, views)
+    for predicate in ("on", "behind"):
+        shared = network.decode(encoding, predicate, GOALS)
+        for b, g, query in np.ndindex(2, 3, 5):
+            trio = [*GOALS[b, g].tolist(), query]
+            alone = network.encode(image[b : b + 1], views[b : b + 1, trio])
+            score = network.decode(alone, predicate, torch.tensor([[[0, 1]]]))[0, 0, 2]
+            assert abs(score - shared[b, g, query]) < 1e-5
+
+
+@pytest.mark.parametrize("body", PAPER)
+@torch.inference_mode()
+def test_a_score_depends_on_the_image_and_three_views(body: str) -> None:
+    network = model(body)
+    image, views = pictures(batch=1)
+    goals = torch.tensor([[[0, 1]]])
+    before = network.decode(network.encode(image, views), "on", goals)[0, 0]
+    darker = network.decode(network.encode(image // 2, views), "on", goals)[0, 0]
+    assert (before - darker).abs().min() > 1e-6
+    for changed in range(5):
+        other = views.clone()
+        other[:, changed] = 255 - other[:, changed]
+        after = network.decode(network.encode(image, other), "on", goals)[0, 0]
+        moved = (before - after).abs()
+        # a subject or reference is seen by all queries, any other object by itself alone
+        for query in range(5):
+            assert (moved[query] > 1e-6) == (changed in (0, 1, query))
+
+
+@torch.inference_mode()
+def test_attention_of_the_vit() -> None:
+    """Where a query's embedding is changed by the subject's view, and patches by each other."""
+    image, views = pictures(batch=1)
+    other = views.clone()
+    other[:, 0] = 255 - other[:, 0]
+    networks = {name: model(name).body for name in ("vit", "vit-trio", "vit-no-patches")}
+    for name, body in networks.items():
+        assert isinstance(body, ViTBody)
+        patches = body.embed(image.float() / 255).flatten(2).transpose(1, 2)
+        pair = [body.embed(v[0, :3].float() / 255).flatten(1)[None] for v in (views, other)]
+        before, after = (body._transform(patches, three)[0, 2] for three in pair)
+        assert ((before - after).abs().max() > 1e-4) == (name != "vit")
+
+
+@torch.inference_mode()
+def test_geometry_looks_at_poses_alone() -> None:
+    network = model("geometry")
+    image, views = pictures()
+    poses = standing()
+    plain = network.decode(network.encode(image, views, poses=poses), "on", GOALS)
+    blind = network.decode(network.encode(image * 0, views * 0, poses=poses), "on", GOALS)
+    assert torch.equal(plain, blind)
+    moved = network.decode(network.encode(image, views, poses=poses + 1), "on", GOALS)
+    assert (plain - moved).abs().max() > 1e-3
+    with pytest.raises(ModelError, match="body geometry is told where objects are, expected pos"):
+        network.encode(image, views)
 
 
 @torch.inference_mode()
@@ -104,8 +168,10 @@ def test_padding_changes_nothing(body: str) -> None:
     image, views = pictures()
     padded = torch.cat([views, torch.full_like(views[:, :3], 200)], dim=1)
     present = torch.arange(8).expand(2, -1) < 5
-    plain = network.decode(network.encode(image, views), "behind", GOALS)
-    wide = network.decode(network.encode(image, padded, present), "behind", GOALS)
+    poses = standing()
+    wider = torch.cat([poses, torch.ones_like(poses[:, :3])], dim=1)
+    plain = network.decode(network.encode(image, views, poses=poses), "behind", GOALS)
+    wide = network.decode(network.encode(image, padded, present, wider), "behind", GOALS)
     torch.testing.assert_close(wide[..., :5], plain, atol=1e-5, rtol=0)
 
 
@@ -116,8 +182,10 @@ def test_order_of_objects_only_reorders_scores(body: str) -> None:
     image, views = pictures()
     order = torch.tensor([3, 0, 4, 2, 1])
     where = order.argsort()
-    plain = network.decode(network.encode(image, views), "on", GOALS)
-    shuffled = network.decode(network.encode(image, views[:, order]), "on", where[GOALS])
+    poses = standing()
+    plain = network.decode(network.encode(image, views, poses=poses), "on", GOALS)
+    turned = network.encode(image, views[:, order], poses=poses[:, order])
+    shuffled = network.decode(turned, "on", where[GOALS])
     torch.testing.assert_close(shuffled, plain[..., order], atol=1e-5, rtol=0)
 
 
@@ -137,7 +205,7 @@ def test_vit_tokens_do_not_see_other_objects() -> None:
 @ALL
 def test_every_predicate_has_a_head_of_its_own(body: str) -> None:
     network = model(body)
-    encoding = network.encode(*pictures())
+    encoding = network.encode(*pictures(), poses=standing())
     network.decode(encoding, PREDICATES["behind"], GOALS).sum().backward()
     heads = network.body.heads
     moved = {
@@ -151,7 +219,7 @@ def test_every_predicate_has_a_head_of_its_own(body: str) -> None:
 @torch.inference_mode()
 def test_subject_and_reference_have_different_roles(body: str) -> None:
     network = model(body)
-    encoding = network.encode(*pictures())
+    encoding = network.encode(*pictures(), poses=standing())
     there = network.decode(encoding, "on", GOALS)
     back = network.decode(encoding, "on", GOALS.flip(-1))
     assert (there - back).abs().max() > 1e-3
@@ -236,10 +304,10 @@ def test_goal_axes_turn_with_the_predicate(predicate: Predicate) -> None:
     c, s = math.cos(turn), math.sin(turn)
     turned = position @ torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     goals = torch.tensor([[[0, 1], [4, 2]]])
-    plain = glimpse._goal_features(geometry(position, size, yaw), PREDICATES["behind"], goals)
-    other = glimpse._goal_features(geometry(turned, size, yaw + turn), predicate, goals)
+    plain = reasoning.goal_features(geometry(position, size, yaw), PREDICATES["behind"], goals)
+    other = reasoning.goal_features(geometry(turned, size, yaw + turn), predicate, goals)
     torch.testing.assert_close(other, plain, atol=1e-5, rtol=0)
-    assert plain.shape == (1, 2, 5, glimpse._GOAL_FEATURES)
+    assert plain.shape == (1, 2, 5, reasoning.GOAL_FEATURES)
 
 
 def test_glimpse_reads_its_geometry() -> None:
@@ -276,7 +344,7 @@ def test_configs_come_back_from_plain_values() -> None:
     for kind in BODIES.values():
         for made in (kind.config(), kind.config.smoke(), kind.config.paper()):
             assert model_config(json.loads(json.dumps(asdict(made)))) == made
-    with pytest.raises(ValueError, match="unknown body 'cnn', expected one of glimpse, vit"):
+    with pytest.raises(ValueError, match="unknown body 'cnn', expected one of geometry, "):
         model_config({"body": "cnn"})
 
 
@@ -314,11 +382,13 @@ def test_one_more_head_leaves_the_others_as_they_are(body: str, near: Predicate)
     after = RelevanceModel(SMALL[body], (*known, "near")).eval()
     scenes = pictures()
     for name in known:
-        scores = [m.decode(m.encode(*scenes), name, GOALS) for m in (before, after)]
+        scores = [
+            m.decode(m.encode(*scenes, poses=standing()), name, GOALS) for m in (before, after)
+        ]
         assert torch.equal(*scores)
-    assert after.decode(after.encode(*scenes), near, GOALS).isfinite().all()
+    assert after.decode(after.encode(*scenes, poses=standing()), near, GOALS).isfinite().all()
     with pytest.raises(ModelError, match="has no head for near, was trained on on-the-left, on-th"):
-        before.decode(before.encode(*scenes), near, GOALS)
+        before.decode(before.encode(*scenes, poses=standing()), near, GOALS)
     after.load_state_dict({**after.state_dict(), **before.state_dict()})  # nothing is renamed
 
 
@@ -335,7 +405,11 @@ def test_a_body_is_registered_from_outside() -> None:
             self.heads = torch.nn.ModuleDict({n: torch.nn.Linear(3, 1) for n in predicates})
 
         def encode(
-            self, image: torch.Tensor, views: torch.Tensor, present: torch.Tensor
+            self,
+            image: torch.Tensor,
+            views: torch.Tensor,
+            present: torch.Tensor,
+            poses: torch.Tensor | None,
         ) -> Encoding:
             return Encoding(tokens=views.mean((-1, -2)), present=present)
 
@@ -364,6 +438,6 @@ def test_any_direction_in_steps_of_the_regressed_ones(angle: int) -> None:
     turned = position @ torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     goals = torch.tensor([[[0, 1], [4, 2]]])
     slanted = replace(PREDICATES["behind"], name="slanted", toward=(c, s))
-    plain = glimpse._goal_features(geometry(position, size, yaw), PREDICATES["behind"], goals)
-    other = glimpse._goal_features(geometry(turned, size, yaw + turn), slanted, goals)
+    plain = reasoning.goal_features(geometry(position, size, yaw), PREDICATES["behind"], goals)
+    other = reasoning.goal_features(geometry(turned, size, yaw + turn), slanted, goals)
     torch.testing.assert_close(other, plain, atol=1e-5, rtol=0)

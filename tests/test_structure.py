@@ -29,6 +29,7 @@ DOORS = {
     "webdataset": ("store",),
     "upath": ("store",),
     "fsspec": ("store",),
+    "monai": ("models",),
     "torch": ("models", "training", "evaluation"),
     "matplotlib": ("report", "benchmarks"),
     "robotic": ("planner",),

@@ -17,6 +17,7 @@ from relevance import training
 from relevance.cli import main
 from relevance.metrics import accuracy
 from relevance.models import BODIES, RelevanceModel
+from relevance.models.geometry import GeometryConfig
 from relevance.models.glimpse import GlimpseConfig
 from relevance.models.vit import VitConfig
 from relevance.scene import PREDICATES, Camera
@@ -25,6 +26,7 @@ from relevance.training import (
     TrainConfig,
     batch_loss,
     draw_batch,
+    draw_batches,
     measure,
     polling,
     relevance_loss,
@@ -207,7 +209,108 @@ def test_the_mirror_shows_the_mirrored_scene(made: Path, examples: Examples) -> 
 SMALL = {
     "glimpse": GlimpseConfig(width=64, heads=2, layers=1, channels=16),
     "vit": VitConfig(width=64, heads=2, layers=1, hidden=64),
+    "geometry": GeometryConfig(width=64, heads=2, layers=1),
 }
+
+
+# --- recipes ------------------------------------------------------------------------------
+
+
+def test_rounds_have_a_batch_of_each_in_every_step(examples: Examples) -> None:
+    config = replace(CONFIG, polling="rounds", mirror=False)
+    steps = [draw_batches(examples, config, step) for step in range(3)]
+    for batches in steps:
+        assert [[turn[0] for turn in b.turns] for b in batches] == [
+            [*SAME_PLANE],
+            [PREDICATES["on"]],
+        ]
+    trainer = training.Trainer(replace(config, model=GlimpseConfig.smoke()), examples)
+    parts = [batch_loss(trainer.model, batch, config)["loss"].item() for batch in steps[0]]
+    assert trainer.step()["loss"] == pytest.approx(np.mean(parts), rel=1e-5)
+
+
+def test_one_by_one_trains_each_for_its_share_of_the_steps(examples: Examples) -> None:
+    config = replace(CONFIG, polling="one-by-one", steps=10, share_encodings=False, mirror=False)
+    seen = [draw_batch(examples, config, step).turns[0][0] for step in range(10)]
+    assert seen == [p for p in PREDICATES.values() for _ in range(2)]
+
+
+def test_queries_are_drawn_uniformly(examples: Examples) -> None:
+    """Each query of a predicate comes as often as any other, whatever its scene or goal has."""
+    config = replace(
+        CONFIG, queries_per_batch=50, goal_objects=False, share_encodings=False,
+        predicates=("behind",), mirror=False, recolor=False,
+    )  # fmt: skip
+    goals = examples.goals[PREDICATES["behind"]]
+    only = replace(examples, goals={PREDICATES["behind"]: goals})
+    asked = goals.asked(goal_objects=False)
+    count = np.zeros(asked.shape)
+    name = {scene: i for i, scene in enumerate(examples.names)}
+    for step in range(200):
+        batch = draw_batch(only, config, step)
+        [(_, pairs, relevant, wanted)] = batch.turns
+        for b, g, query in wanted.nonzero().tolist():
+            scene = name[batch.names[b]]
+            [k] = [
+                k
+                for k in range(goals.first[scene], goals.first[scene + 1])
+                if goals.pairs[k].tolist() == pairs[b, g].tolist()
+            ]
+            assert goals.relevant[k, query] == relevant[b, g, query]
+            assert query not in pairs[b, g].tolist()
+            count[k, query] += 1
+    assert (count[~asked] == 0).all()
+    share = 1 - (1 - 1 / asked.sum()) ** 50  # drawn at least once in a batch
+    assert np.abs(count[asked] / 200 - share).max() < 5 * np.sqrt(share * (1 - share) / 200)
+
+
+def test_goal_objects_can_be_left_out_of_the_loss(examples: Examples) -> None:
+    torch.manual_seed(0)
+    model = RelevanceModel(VitConfig.smoke())
+    batch = draw_batch(examples, replace(CONFIG, mirror=False), 1)
+    [(predicate, goals, relevant, labelled)] = batch.turns
+    encoding = model.encode(batch.image, batch.views, batch.present)
+    scores = model.decode(encoding, predicate, goals)
+    queries = labelled.clone()
+    for b, g in np.ndindex(*goals.shape[:2]):
+        queries[b, g, goals[b, g]] = False
+    expected = relevance_loss(scores, relevant, queries, CONFIG.eta_on)
+    found = batch_loss(model, batch, replace(CONFIG, goal_objects=False))["relevance"]
+    assert found.item() == pytest.approx(expected.item(), rel=1e-5)
+    assert found.item() != pytest.approx(batch_loss(model, batch, CONFIG)["relevance"].item())
+
+
+def test_the_bare_recipe_is_plain_adam(examples: Examples) -> None:
+    paper = TrainConfig.paper()
+    config = replace(paper, model=VitConfig.smoke(), predicates=(), device="auto", bfloat16="off")
+    trainer = training.Trainer(config, examples)
+    assert {trainer.rate(step) for step in (0, 1, 1000, 499_999)} == {1e-5}
+    before = [w.detach().clone() for w in trainer.model.parameters()]
+    torch.manual_seed(0)
+    plain = training.Trainer(config, examples)
+    adam = torch.optim.Adam(plain.model.parameters(), lr=1e-5)
+    for step in range(2):
+        trainer.step()
+        adam.zero_grad()
+        batch_loss(plain.model, draw_batch(examples, config, step), config)["loss"].backward()
+        adam.step()
+    pairs = zip(trainer.model.parameters(), plain.model.parameters(), before, strict=True)
+    assert any((a != c).any() for a, _, c in pairs)
+    for a, b in zip(trainer.model.parameters(), plain.model.parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-8)
+
+
+def test_a_loss_that_is_no_number_names_the_scenes(examples: Examples) -> None:
+    trainer = training.Trainer(CONFIG, examples)
+    trainer.step()
+    with torch.no_grad():
+        for weight in trainer.model.body.heads.parameters():
+            weight.fill_(torch.inf)
+    with pytest.raises(training.TrainingError, match="step 1: the loss is nan on scenes ") as error:
+        trainer.step()
+    assert trainer.done == 1
+    names = draw_batch(examples, CONFIG, 1).names
+    assert all(name in str(error.value) for name in names)
 
 
 # --- the loss and learning ----------------------------------------------------------------
@@ -398,7 +501,7 @@ def test_another_body_takes_the_sizes_of_the_preset() -> None:
     assert TrainConfig.demo().with_body("vit").model == VitConfig()
     assert TrainConfig.paper().with_body("glimpse").model == GlimpseConfig.paper()
     assert CONFIG.with_body("glimpse") == CONFIG
-    with pytest.raises(ValueError, match="unknown body 'cnn', expected one of glimpse, vit"):
+    with pytest.raises(ValueError, match="unknown body 'cnn', expected one of geometry, "):
         CONFIG.with_body("cnn")
 
 
@@ -422,8 +525,6 @@ def test_flags_are_those_of_the_body_that_is_asked_for(capsys: pytest.CaptureFix
         assert {"--model.body", "--model.width", own} <= set(shown.split())
         assert other not in shown.split()
     assert main(["train", "none", "--model.body", "cnn"]) == 2
-    assert "unknown body 'cnn', expected one of glimpse, vit" in capsys.readouterr().err
-    assert (
-        main(["train", "none", "--model.body", "vit", "--model.width", "64", "--steps", "1"]) == 2
-    )
+    assert "unknown body 'cnn', expected one of geometry, " in capsys.readouterr().err
+    assert main(["train", "none", "--model.body", "vit", "--model.width", "64"]) == 2
     assert "no dataset.json there" in capsys.readouterr().err

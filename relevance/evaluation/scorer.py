@@ -95,13 +95,18 @@ class NetworkScorer:
             self.observe(scene, rendering.image, rendering.views)
         import torch
 
+        from relevance.models import true_geometry
+
         start = time.process_time()
         device = next(self.model.parameters()).device
         with torch.inference_mode():
             if key not in self._encodings:
                 image, views = (torch.from_numpy(p).to(device) for p in self._seen[key])
+                poses = torch.from_numpy(true_geometry(scene)).to(device)[None]
                 encoding = self.model.encode(
-                    image.permute(2, 0, 1)[None], views.permute(0, 3, 1, 2)[None]
+                    image.permute(2, 0, 1)[None],
+                    views.permute(0, 3, 1, 2)[None],
+                    poses=poses if self.model.told else None,
                 )
                 self._keep(self._encodings, key, encoding)
             encoding = self._encodings[key]

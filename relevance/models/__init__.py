@@ -1,10 +1,15 @@
 """Vision models that score how relevant each object is to a goal: bodies behind one interface.
 
 `encode` looks at a scene once; `decode` scores every object for any number of goals from
-that one encoding. Bodies: `vit` is the paper's (32x32 patches, one shared convolutional
-embedding, all views at position zero) with image tokens that never see object tokens, which
-is what makes the sharing exact; `glimpse` first finds each object by matching its canonical
-view with the image, then looks at a window around it. Every predicate has its own head.
+that one encoding. Bodies that look at a subject, a reference and a query together encode what
+does not depend on the query, and do the rest anew for each. Every predicate has its own head.
+
+- `vit`: the paper's transformer (32x32 patches, one shared convolutional embedding, all views
+  at position zero). With `shared` attention image tokens never see object tokens, which is
+  what makes one encoding serve all goals exactly; `trio` is the paper's own.
+- `resnet`, `resnet3d`: the paper's two others.
+- `glimpse`: finds each object by matching its view with the image, looks at a window around it.
+- `geometry`: no picture, the true poses.
 
 A body is a file of this package that registers itself; nothing else names it.
 
@@ -17,13 +22,19 @@ from pkgutil import iter_modules
 
 from relevance.models.config import PATCH, STRIDE, Encoding, ModelConfig, ModelError
 from relevance.models.layers import Attention, Extractor
-from relevance.models.poses import ANGLES, DECIMETRE, GEOMETRY, half_extents, mirrored
+from relevance.models.poses import (
+    ANGLES,
+    DECIMETRE,
+    GEOMETRY,
+    half_extents,
+    mirrored,
+    true_geometry,
+)
 from relevance.models.registry import (
     BODIES,
     Body,
     BodyKind,
     RelevanceModel,
-    config_values,
     model_config,
 )
 
@@ -45,8 +56,8 @@ __all__ = [
     "ModelConfig",
     "ModelError",
     "RelevanceModel",
-    "config_values",
     "half_extents",
     "mirrored",
     "model_config",
+    "true_geometry",
 ]

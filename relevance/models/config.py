@@ -66,10 +66,13 @@ class Encoding:
     """A batch of scenes, seen once; all that `decode` and the auxiliary losses need."""
 
     tokens: Tensor
-    """(B, N, D), one token an object."""
+    """(B, N, D), one token an object; before it met the others where nothing can be shared."""
     present: Tensor
     """(B, N) bool; False for padding."""
     geometry: Tensor | None = None
-    """(B, N, GEOMETRY) estimated geometry, decimetres (glimpse)."""
+    """(B, N, GEOMETRY) estimated or given geometry, decimetres (glimpse, geometry)."""
+    scene: Tensor | None = None
+    """(B, ...) what was seen of the scene apart from its objects, for bodies that look at a
+    subject, a reference and a query together."""
     match: Tensor | None = None
     """(B, N, h*w) logits of where the object is in the feature map (glimpse)."""

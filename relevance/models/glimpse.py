@@ -17,13 +17,12 @@ from torch.nn import functional as F
 
 from relevance.configs import config
 from relevance.models.config import PATCH, STRIDE, Encoding, ModelConfig, divides
-from relevance.models.layers import Attention, columns, pick, small_cnn
-from relevance.models.poses import ANGLES, DECIMETRE, GEOMETRY
+from relevance.models.layers import Attention, columns, small_cnn
+from relevance.models.poses import DECIMETRE, GEOMETRY
+from relevance.models.reasoning import Reasoning, object_heads
 from relevance.models.registry import BODIES, Body, BodyKind
-from relevance.scene import Camera, Predicate, Robot, camera_up
+from relevance.scene import Camera, Predicate, camera_up
 
-ROBOT = Robot()
-"""Whose axes the directions of goals are: every picture was taken in front of this one."""
 _GROUND = 0.035
 """Height at which a sight line is cut for a first guess of the position, m: half a box."""
 
@@ -88,27 +87,14 @@ class GlimpseBody(Body):
         self.estimate = nn.Sequential(nn.Linear(seen, width), nn.GELU(), nn.Linear(width, GEOMETRY))
         self.token = nn.Sequential(nn.Linear(seen + GEOMETRY, width), nn.GELU())
         self.among = Attention(width, config.heads, expansion=2)
-        self.place = nn.Sequential(
-            nn.Linear(_GOAL_FEATURES, width), nn.GELU(), nn.Linear(width, width)
-        )
-        self.predicate = nn.ParameterDict(
-            {name: nn.Parameter(torch.zeros(width)) for name in predicates}
-        )
-        self.goal_layers = nn.ModuleList(
-            Attention(width, config.heads, expansion=2) for _ in range(config.layers)
-        )
-        self.heads = nn.ModuleDict(
-            {
-                name: nn.Sequential(
-                    nn.LayerNorm(width), nn.Linear(width, width), nn.GELU(), nn.Linear(width, 1)
-                )
-                for name in predicates
-            }
-        )
+        self.reason = Reasoning(width, config.heads, config.layers, predicates)
+        self.heads = object_heads(width, predicates)
         self.cells_P2: Tensor
         self.register_buffer("cells_P2", _cell_centres(config.camera), persistent=False)
 
-    def encode(self, image: Tensor, views: Tensor, present: Tensor) -> Encoding:
+    def encode(
+        self, image: Tensor, views: Tensor, present: Tensor, poses: Tensor | None
+    ) -> Encoding:
         """As `RelevanceModel.encode`, inputs float in 0..1."""
         batch, objects = views.shape[:2]
         features_BEP = self.scene(image - 0.5).flatten(2)
@@ -152,45 +138,8 @@ class GlimpseBody(Body):
     def decode(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
         """As `RelevanceModel.decode`."""
         assert encoding.geometry is not None
-        tokens, present = encoding.tokens, encoding.present
-        batch, objects = present.shape
-        features = _goal_features(encoding.geometry, predicate, goals)
-        x = tokens[:, None] + self.place(features) + self.predicate[predicate.name]
-        x = x.flatten(0, 1)
-        allowed = columns(present).repeat_interleave(goals.shape[1], dim=0)
-        for layer in self.goal_layers:
-            x = layer(x, allowed)
-        return self.heads[predicate.name](x).view(batch, -1, objects)
-
-
-_GOAL_FEATURES = 3 * GEOMETRY + 2 + 2 * 8
-
-
-def _goal_features(geometry: Tensor, predicate: Predicate, goals: Tensor) -> Tensor:
-    """Where every object is as the goal sees it, (B, G, N, _GOAL_FEATURES).
-
-    Axes: along and across the predicate's direction (x and y for `on`). Own geometry, the
-    subject's, the reference's, two role flags, and for subject and reference the distance
-    and the signed clearance of the footprints along both axes: what "beside" turns on.
-    """
-    u = predicate.direction(ROBOT) or (1.0, 0.0)
-    axes = geometry.new_tensor([[u[0], u[1]], [-u[1], u[0]]])
-    # Extents along the goal's axes: those of the regressed directions that are nearest.
-    turn = round(math.atan2(u[1], u[0]) / (math.pi / ANGLES))
-    extents = geometry[..., 6:].roll(-turn, dims=-1)
-    place = torch.cat([geometry[..., :2] @ axes.T, geometry[..., 2:6], extents], dim=-1)
-    objects, count = place.shape[1], goals.shape[1]
-    own = place[:, None].expand(-1, count, -1, -1)
-    roles = torch.arange(objects, device=goals.device)[:, None] == goals[..., None, :]
-    features = [own, roles.to(place.dtype)]
-    for role in range(2):
-        anchor = pick(place, goals[..., role])[:, :, None]
-        delta = own[..., :3] - anchor[..., :3]
-        reach = (own + anchor)[..., [6, 6 + ANGLES // 2]]
-        apart = delta[..., :2].abs()
-        clear = apart - reach
-        features += [anchor.expand_as(own), delta, apart, clear, clear.amax(-1, keepdim=True)]
-    return torch.cat(features, dim=-1)
+        x = self.reason(encoding.tokens, encoding.present, encoding.geometry, predicate, goals)
+        return self.heads[predicate.name](x).squeeze(-1)
 
 
 def _cell_centres(camera: Camera) -> Tensor:

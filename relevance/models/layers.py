@@ -1,9 +1,11 @@
 """Layers that more than one body is made of.
 
-Shape suffixes: B scenes, N objects (padded), G goals, L tokens, D width.
+Shape suffixes: B scenes, N objects (padded), G goals, T trios, L tokens, D width.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -54,6 +56,12 @@ class Extractor(nn.Module):
         hidden = F.relu(pair[:, :, None] + self.query(tokens)[:, None])
         return self.score(F.relu(self.second(hidden))).squeeze(-1)
 
+    def of_trios(self, tokens: Tensor) -> Tensor:
+        """Scores (...) from the tokens (..., 3, D) of subject, reference and query."""
+        subject, reference, query = tokens.unbind(-2)
+        hidden = F.relu(self.subject(subject) + self.reference(reference) + self.query(query))
+        return self.score(F.relu(self.second(hidden))).squeeze(-1)
+
 
 def small_cnn(channels: int, widths: tuple[int, int, int], width: int) -> nn.Sequential:
     """A 32x32 picture to a vector of `width`."""
@@ -69,6 +77,59 @@ def small_cnn(channels: int, widths: tuple[int, int, int], width: int) -> nn.Seq
         nn.Linear(c * (PATCH // 8) ** 2, width),
         nn.ReLU(),
     )
+
+
+def extractor(heads: nn.ModuleDict, name: str) -> Extractor:
+    """The extractor of a predicate."""
+    found = heads[name]
+    assert isinstance(found, Extractor)
+    return found
+
+
+def residual(dimensions: int, blocks: Sequence[int], channels: int) -> tuple[nn.Module, int]:
+    """A ResNet over pictures or stacks of them (B, 3, ...), and the width of what it gives (B, C).
+
+    Group norm in the place of batch norm: a batch has few scenes, many of its views are padding,
+    and what a scene gets must not depend on who else is in the batch.
+    """
+    # Here and not above: monai takes seconds to import.
+    from monai.networks.nets.resnet import ResNet
+
+    planes = [channels * 2**stage for stage in range(4)]
+    net = ResNet(
+        block="basic",
+        # monai's has four stages; those that are not wanted go.
+        layers=[*blocks, *[1] * (4 - len(blocks))],
+        block_inplanes=planes,
+        spatial_dims=dimensions,
+        n_input_channels=3,
+        conv1_t_stride=2,
+        feed_forward=False,
+        norm=("group", {"num_groups": 8}),
+    )
+    for stage in range(len(blocks), 4):
+        setattr(net, f"layer{stage + 1}", nn.Identity())
+    return net, planes[len(blocks) - 1]
+
+
+def each_trio(
+    score: Callable[[Tensor], Tensor], goals: Tensor, objects: int, at_once: int
+) -> Tensor:
+    """Scores (B, G, N) of a body that looks at subject, reference and query together.
+
+    `score` gives (B, T) for places (B, T, 3) of T trios, at most `at_once` of them.
+    """
+    batch, count = goals.shape[:2]
+    pair_BGN2 = goals[:, :, None].expand(-1, -1, objects, -1)
+    query_BGN1 = torch.arange(objects, device=goals.device).expand(batch, count, -1)[..., None]
+    trios_BT3 = torch.cat([pair_BGN2, query_BGN1], dim=-1).flatten(1, 2)
+    scores = [score(part) for part in trios_BT3.split(at_once, dim=1)]
+    return torch.cat(scores, dim=1).view(batch, count, objects)
+
+
+def pick_trios(tokens: Tensor, trios: Tensor) -> Tensor:
+    """Tokens (B, T, 3, D) of the objects at places (B, T, 3)."""
+    return pick(tokens, trios.flatten(1)).unflatten(1, trios.shape[1:])
 
 
 def pick(x: Tensor, index: Tensor) -> Tensor:

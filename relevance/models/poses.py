@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from relevance.scene import Scene
 
 ANGLES = 8
 """Directions over a half turn along which footprint half-extents are regressed."""
@@ -37,3 +40,12 @@ def mirrored(geometry: Tensor) -> Tensor:
     sign[1] = -1
     order = [*range(6), *(6 + (ANGLES - k) % ANGLES for k in range(ANGLES))]
     return (geometry * sign)[..., order]
+
+
+def true_geometry(scene: Scene) -> np.ndarray:
+    """Position, size and footprint half-extents of every box, (N, GEOMETRY), decimetres."""
+    size = torch.tensor([box.size for box in scene.objects], dtype=torch.float64)
+    yaw = torch.tensor([box.yaw for box in scene.objects], dtype=torch.float64)
+    position = torch.tensor([box.position for box in scene.objects], dtype=torch.float64)
+    extents = half_extents(size[:, 0], size[:, 1], yaw)
+    return (torch.cat([position, size, extents], dim=1) / DECIMETRE).numpy().astype(np.float32)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -28,9 +28,14 @@ class Body(nn.Module, ABC):
     """What answers for each predicate, by its name. Made after all else, in the order that is
     given, so that one more head leaves the first weights of the rest as they are."""
 
+    told = False
+    """Whether it is told where the objects are instead of being shown them."""
+
     @abstractmethod
-    def encode(self, image: Tensor, views: Tensor, present: Tensor) -> Encoding:
-        """As `RelevanceModel.encode`, inputs float in 0..1."""
+    def encode(
+        self, image: Tensor, views: Tensor, present: Tensor, poses: Tensor | None
+    ) -> Encoding:
+        """As `RelevanceModel.encode`, pictures float in 0..1."""
 
     @abstractmethod
     def decode(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
@@ -68,12 +73,27 @@ class RelevanceModel(nn.Module):
         """Where the weights are; every input is brought there."""
         return next(self.parameters()).device
 
-    def encode(self, image: Tensor, views: Tensor, present: Tensor | None = None) -> Encoding:
+    @property
+    def told(self) -> bool:
+        """Whether `encode` needs poses; the pictures are nothing to it then."""
+        return self.body.told
+
+    def encode(
+        self,
+        image: Tensor,
+        views: Tensor,
+        present: Tensor | None = None,
+        poses: Tensor | None = None,
+    ) -> Encoding:
         """See a batch of scenes once, for all goals.
 
         image (B, 3, H, W) and views (B, N, 3, 32, 32), uint8 or float in 0..1; present
-        (B, N) bool, default all. Raises ModelError for an image of another size.
+        (B, N) bool, default all; poses (B, N, GEOMETRY) as `true_geometry` gives them, looked at
+        by the body `geometry` alone. Raises ModelError for an image of another size and for
+        poses that are missing.
         """
+        if self.told and poses is None:
+            raise ModelError(f"body {self.config.body} is told where objects are, expected poses")
         camera = self.config.camera
         if tuple(image.shape[-2:]) != (camera.height, camera.width):
             raise ModelError(
@@ -84,7 +104,10 @@ class RelevanceModel(nn.Module):
             present = torch.ones(views.shape[:2], dtype=torch.bool)
         device = self.device
         return self.body.encode(
-            _unit(image.to(device)), _unit(views.to(device)), present.to(device)
+            _unit(image.to(device)),
+            _unit(views.to(device)),
+            present.to(device),
+            None if poses is None else poses.to(device),
         )
 
     def decode(self, encoding: Encoding, predicate: Predicate | str, goals: Tensor) -> Tensor:
@@ -101,7 +124,7 @@ class RelevanceModel(nn.Module):
 
 
 def model_config(values: Any) -> Any:
-    """The settings that `config_values` wrote, or an instance as it is; see `ModelConfig`.
+    """The settings from the plain values that `asdict` gave, or an instance as it is.
 
     Raises ConfigError for a setting that the body does not have, RelevanceError for a body that
     is not there.
@@ -109,11 +132,6 @@ def model_config(values: Any) -> Any:
     if isinstance(values, Mapping) and "body" in values:
         return BODIES[values["body"]].config(**values)
     return values
-
-
-def config_values(config: ModelConfig) -> dict[str, Any]:
-    """Plain numbers, strings and dicts; `model_config` gives an equal config back."""
-    return asdict(config)
 
 
 def _unit(x: Tensor) -> Tensor:

@@ -23,10 +23,17 @@ from relevance.training.checkpoints import (
     save_checkpoint,
     write_row,
 )
-from relevance.training.examples import Batch, Examples, draw_batch, load_examples, polling
+from relevance.training.examples import (
+    Batch,
+    Examples,
+    draw_batch,
+    draw_batches,
+    load_examples,
+    polling,
+)
 from relevance.training.losses import batch_loss, relevance_loss
 from relevance.training.settings import TRAINER_VERSION, TrainConfig
-from relevance.training.trainer import Trainer, measure, train, use_bfloat16
+from relevance.training.trainer import Trainer, TrainingError, measure, train, use_bfloat16
 
 __all__ = [
     "CHECKPOINT_VERSION",
@@ -36,10 +43,12 @@ __all__ = [
     "Examples",
     "TrainConfig",
     "Trainer",
+    "TrainingError",
     "age",
     "batch_loss",
     "checkpoint_id",
     "draw_batch",
+    "draw_batches",
     "find_checkpoint",
     "load_checkpoint",
     "load_examples",

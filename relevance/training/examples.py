@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from relevance.models import DECIMETRE, GEOMETRY, PATCH, STRIDE, half_extents, mirrored
-from relevance.scene import PREDICATES, Camera, Predicate, Scene
+from relevance.models import GEOMETRY, PATCH, STRIDE, mirrored, true_geometry
+from relevance.scene import PREDICATES, Camera, Predicate
 from relevance.store import Dataset, DatasetError, Files
 from relevance.training.settings import TrainConfig
 
@@ -39,6 +39,13 @@ class Goals:
     first: np.ndarray
     """(S + 1,) int64: the goals of scene i are first[i] to first[i + 1]."""
 
+    def asked(self, *, goal_objects: bool) -> np.ndarray:
+        """(K, N) bool: the labelled objects, with or without subject and reference."""
+        if goal_objects:
+            return self.labelled
+        objects = np.arange(self.labelled.shape[1])
+        return self.labelled & (objects != self.pairs[..., None]).all(1)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Examples:
@@ -54,6 +61,8 @@ class Examples:
     """(S, N, GEOMETRY) float32, decimetres."""
     present: np.ndarray
     """(S, N) bool."""
+    names: tuple[str, ...]
+    """Ids of the scenes, S."""
     goals: dict[Predicate, Goals]
 
     def scenes(self, predicates: Sequence[Predicate]) -> np.ndarray:
@@ -74,6 +83,8 @@ class Batch:
     """(B, N) bool."""
     cells: Tensor
     """(B, h, w) uint8."""
+    names: tuple[str, ...]
+    """Ids of the scenes, B."""
     geometry: Tensor
     """(B, N, GEOMETRY)."""
     turns: tuple[tuple[Predicate, Tensor, Tensor, Tensor], ...]
@@ -86,6 +97,7 @@ class Batch:
             views=self.views.to(device),
             present=self.present.to(device),
             cells=self.cells.to(device),
+            names=self.names,
             geometry=self.geometry.to(device),
             turns=tuple(
                 (p, goals.to(device), relevant.to(device), labelled.to(device))
@@ -101,6 +113,7 @@ def load_examples(
     camera: Camera,
     policy: str = "found",
     ambiguous: bool = True,
+    predicates: Sequence[str] = (),
     cache_bytes: int = 1_500_000_000,
     folder: Path | None = None,
 ) -> Examples:
@@ -108,17 +121,21 @@ def load_examples(
 
     Raises DatasetError for a broken file, labels that were not all made in one way, a label about
     a scene that is not there, or an image of another size than the camera's. Arrays over
-    `cache_bytes` are mapped from a nameless file in `folder`.
+    `cache_bytes` are mapped from a nameless file in `folder`. `predicates` are those whose
+    labels are read, all when empty.
     """
     one_labelling(dataset, split, policy)
     query = """
         select scene_id, predicate, subject, reference, list(query order by query),
             list(relevant order by query)
         from labels where split = ? and policy = ? and (? or not ambiguous)
+            and (? or predicate in (select unnest(?::varchar[])))
         group by all order by all
     """
     with dataset.connect(policy=policy) as connection:
-        rows = connection.execute(query, [split, policy, ambiguous]).fetchall()
+        rows = connection.execute(
+            query, [split, policy, ambiguous, not predicates, list(predicates)]
+        ).fetchall()
     labels: dict[str, list[tuple[Any, ...]]] = {
         key: list(group) for key, group in groupby(rows, key=lambda row: row[0])
     }
@@ -132,6 +149,7 @@ def load_examples(
     geometry = np.zeros((total, objects, GEOMETRY), np.float32)
     present = np.zeros((total, objects), bool)
     found: dict[Predicate, list[tuple[int, list[int], np.ndarray, np.ndarray]]] = {}
+    names: list[str] = []
     done = 0
     for sample in dataset.samples(split) if total else ():
         asked = labels.pop(sample.scene.id, None)
@@ -155,6 +173,7 @@ def load_examples(
             relevant[index], labelled[index] = answers, True
             pair = [place[subject], place[reference]]
             found.setdefault(PREDICATES[predicate], []).append((done, pair, relevant, labelled))
+        names.append(sample.scene.id)
         done += 1
     if labels:
         raise DatasetError(
@@ -168,6 +187,7 @@ def load_examples(
         cells=cells,
         geometry=geometry,
         present=present,
+        names=tuple(names),
         goals=goals,
     )
 
@@ -193,15 +213,6 @@ def one_labelling(dataset: Files, split: str, policy: str) -> None:
                     f"{file}: made by {key} {made[key]}, expected {expected} as all labels of "
                     f"split {split}; `relevance label` finishes what was begun"
                 )
-
-
-def true_geometry(scene: Scene) -> np.ndarray:
-    """Position, size and footprint half-extents of every box, (N, GEOMETRY), decimetres."""
-    size = torch.tensor([box.size for box in scene.objects], dtype=torch.float64)
-    yaw = torch.tensor([box.yaw for box in scene.objects], dtype=torch.float64)
-    position = torch.tensor([box.position for box in scene.objects], dtype=torch.float64)
-    extents = half_extents(size[:, 0], size[:, 1], yaw)
-    return (torch.cat([position, size, extents], dim=1) / DECIMETRE).numpy().astype(np.float32)
 
 
 def _goals(items: list[tuple[int, list[int], np.ndarray, np.ndarray]], total: int) -> Goals:
@@ -231,13 +242,19 @@ def gather(
     *,
     limit: int | None = None,
     rng: np.random.Generator | None = None,
+    only: Sequence[Sequence[np.ndarray]] | None = None,
 ) -> Batch:
-    """These scenes and their goals; at most `limit` goals a scene, drawn by `rng`."""
+    """These scenes and their goals; at most `limit` goals a scene, drawn by `rng`.
+
+    `only` names the goals for each predicate and scene.
+    """
     turns = []
-    for predicate in predicates:
+    for number, predicate in enumerate(predicates):
         goals = examples.goals[predicate]
         first = goals.first.tolist()
         rows = [np.arange(first[i], first[i + 1]) for i in chosen.tolist()]
+        if only is not None:
+            rows = only[number]
         if limit is not None and rng is not None:
             rows = [r if len(r) <= limit else np.sort(rng.permutation(r)[:limit]) for r in rows]
         most = max(1, *(len(r) for r in rows))
@@ -254,6 +271,7 @@ def gather(
         views=torch.from_numpy(examples.views[chosen, :most]).permute(0, 1, 4, 2, 3),
         present=torch.from_numpy(examples.present[chosen, :most]),
         cells=torch.from_numpy(examples.cells[chosen]),
+        names=tuple(examples.names[i] for i in chosen.tolist()),
         geometry=torch.from_numpy(examples.geometry[chosen, :most]),
         turns=tuple((p, g, r[..., :most], m[..., :most]) for p, g, r, m in turns),
     )
@@ -283,14 +301,54 @@ def polling(predicates: Sequence[Predicate], *, share: bool) -> list[tuple[Predi
     return [tuple(group) for _, group in groupby(predicates, key=lambda p: p.family)]
 
 
+def draw_batches(examples: Examples, config: TrainConfig, step: int) -> list[Batch]:
+    """What a step learns from: one batch, or one of each group of predicates in a round."""
+    groups = polling(list(examples.goals), share=config.share_encodings)
+    if config.polling == "rounds":
+        return [_draw(examples, config, group, step, i, step) for i, group in enumerate(groups)]
+    return [draw_batch(examples, config, step)]
+
+
 def draw_batch(examples: Examples, config: TrainConfig, step: int) -> Batch:
     """The batch of a step: a pure function of the examples, the config and the step.
 
-    Step s takes group s mod n of the polling round. Each group goes through its own scenes in
-    an order of its own, all of them before any comes again.
+    In turns, step s takes group s mod n of the polling round; one by one, the steps are shared
+    out evenly. Each group goes through its own scenes in an order of its own, all of them before
+    any comes again.
     """
     groups = polling(list(examples.goals), share=config.share_encodings)
-    predicates, visit = groups[step % len(groups)], step // len(groups)
+    if config.polling == "one-by-one":
+        each = -(-config.steps // len(groups))
+        return _draw(examples, config, groups[step // each], step % each, 0, step)
+    return _draw(examples, config, groups[step % len(groups)], step // len(groups), 0, step)
+
+
+def _draw(
+    examples: Examples,
+    config: TrainConfig,
+    predicates: tuple[Predicate, ...],
+    visit: int,
+    stream: int,
+    step: int,
+) -> Batch:
+    rng = _rng(config.seed, 2, stream, step)
+    channels = rng.permutation(3) if config.recolor else None
+    flip = config.mirror and bool(rng.integers(2))
+    if config.queries_per_batch:
+        batch = _queries(examples, config, predicates, rng)
+    else:
+        chosen = _scenes(examples, config, predicates, visit)
+        batch = gather(examples, chosen, predicates, limit=config.goals_per_scene, rng=rng)
+    if channels is not None:
+        order = torch.from_numpy(channels)
+        batch = replace(batch, image=batch.image[:, order], views=batch.views[:, :, order])
+    return in_the_mirror(batch) if flip else batch
+
+
+def _scenes(
+    examples: Examples, config: TrainConfig, predicates: tuple[Predicate, ...], visit: int
+) -> np.ndarray:
+    """The scenes (B,) of a group's batch: its own, in an order of each epoch."""
     scenes = examples.scenes(predicates)
     stream = list(PREDICATES.values()).index(predicates[0])
     wanted = np.arange(visit * config.scenes_per_batch, (visit + 1) * config.scenes_per_batch)
@@ -299,15 +357,47 @@ def draw_batch(examples: Examples, config: TrainConfig, step: int) -> Batch:
         epoch: _rng(config.seed, 1, stream, epoch).permutation(len(scenes))
         for epoch in set(epochs.tolist())
     }
-    chosen = np.array([scenes[orders[e][p]] for e, p in zip(epochs, places, strict=True)])
-    rng = _rng(config.seed, 2, 0, step)
-    channels = rng.permutation(3) if config.recolor else None
-    flip = config.mirror and bool(rng.integers(2))
-    batch = gather(examples, chosen, predicates, limit=config.goals_per_scene, rng=rng)
-    if channels is not None:
-        order = torch.from_numpy(channels)
-        batch = replace(batch, image=batch.image[:, order], views=batch.views[:, :, order])
-    return in_the_mirror(batch) if flip else batch
+    return np.array([scenes[orders[e][p]] for e, p in zip(epochs, places, strict=True)])
+
+
+def _queries(
+    examples: Examples,
+    config: TrainConfig,
+    predicates: tuple[Predicate, ...],
+    rng: np.random.Generator,
+) -> Batch:
+    """Queries drawn uniformly among all of the group's, and the scenes that they are about."""
+    asked = [examples.goals[p].asked(goal_objects=config.goal_objects) for p in predicates]
+    places = [np.argwhere(mask) for mask in asked]
+    drawn = np.sort(rng.choice(sum(map(len, places)), config.queries_per_batch))
+    bounds = np.cumsum([0, *map(len, places)])
+    parts = [
+        place[drawn[(drawn >= low) & (drawn < high)] - low]
+        for place, low, high in zip(places, bounds[:-1], bounds[1:], strict=True)
+    ]
+    owners = [
+        np.searchsorted(examples.goals[p].first, part[:, 0], side="right") - 1
+        for p, part in zip(predicates, parts, strict=True)
+    ]
+    chosen = np.unique(np.concatenate(owners))
+    batch = gather(
+        examples,
+        chosen,
+        predicates,
+        only=[
+            [np.unique(part[owner == scene, 0]) for scene in chosen]
+            for part, owner in zip(parts, owners, strict=True)
+        ],
+    )
+    turns = []
+    for turn, part, owner in zip(batch.turns, parts, owners, strict=True):
+        wanted = torch.zeros_like(turn[3])
+        for (goal, query), scene in zip(part.tolist(), owner.tolist(), strict=True):
+            mine = np.unique(part[owner == scene, 0])
+            at = int(np.searchsorted(chosen, scene)), int(np.searchsorted(mine, goal))
+            wanted[(*at, query)] = True
+        turns.append((*turn[:3], wanted))
+    return replace(batch, turns=tuple(turns))
 
 
 def _rng(seed: int, purpose: int, stream: int, index: int) -> np.random.Generator:

@@ -17,14 +17,15 @@ from relevance.training.settings import TrainConfig
 
 def batch_loss(model: RelevanceModel, batch: Batch, config: TrainConfig) -> dict[str, Tensor]:
     """The loss of a batch and its parts; every scene is encoded once for all its goals."""
-    encoding = model.encode(batch.image, batch.views, batch.present)
+    encoding = model.encode(batch.image, batch.views, batch.present, batch.geometry)
     parts: dict[str, Tensor] = {}
-    terms = [
-        relevance_loss(
-            model.decode(encoding, predicate, goals), relevant, labelled, config.eta(predicate)
-        )
-        for predicate, goals, relevant, labelled in batch.turns
-    ]
+    terms = []
+    for predicate, goals, relevant, labelled in batch.turns:
+        if not config.goal_objects:
+            objects = torch.arange(labelled.shape[-1], device=goals.device)
+            labelled = labelled & (objects != goals[..., None]).all(-2)
+        scores = model.decode(encoding, predicate, goals)
+        terms.append(relevance_loss(scores, relevant, labelled, config.eta(predicate)))
     parts["relevance"] = torch.stack(terms).mean()
     loss = config.relevance_weight * parts["relevance"]
     if encoding.match is not None and encoding.geometry is not None:

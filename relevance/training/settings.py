@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 
 from relevance.configs import config, execution, identity_hash
 from relevance.models import BODIES, ModelConfig, model_config
-from relevance.scene import Predicate
+from relevance.scene import PREDICATES, Predicate
 
 TRAINER_VERSION = "1"
 """Raised when equal settings on equal data come to mean other weights."""
@@ -40,15 +40,31 @@ class TrainConfig:
     scenes_per_batch: Count = 16
     goals_per_scene: Count = 16
     """Most goals of a scene and predicate in one batch."""
+    queries_per_batch: Annotated[int, Field(ge=0)] = 0
+    """More than 0: a batch is that many queries of a predicate, drawn uniformly among all of
+    them, as in the paper, instead of whole scenes with their goals."""
+    predicates: tuple[str, ...] = ()
+    """What one network learns; all that are labelled when empty. (The paper trains one for the
+    four same-plane predicates and another for `on`.)"""
+    start: str = ""
+    """Id of a checkpoint of the dataset whose weights are taken over and stay as they are: only
+    heads that it lacks are trained, those of `predicates`."""
+    polling: Literal["turns", "rounds", "one-by-one"] = "turns"
+    """turns: one predicate's batch a step, in rotation; rounds: a batch of each in every step;
+    one-by-one: each predicate for its share of the steps, the next begins when it is done."""
+    goal_objects: bool = True
+    """Whether subject and reference are asked about in the loss, too (not in the paper's)."""
     share_encodings: bool = True
     """Consecutive turns of the same-plane predicates take the same scenes and one step."""
     learning_rate: Positive = 8e-4
     weight_decay: Weight = 0.02
     betas: tuple[Share, Share] = (0.9, 0.98)
+    schedule: Literal["cosine", "constant"] = "cosine"
+    """What the learning rate does after the warm-up."""
     warmup: Share = 0.05
-    """Share of the steps over which the learning rate rises; then it falls as a cosine."""
-    clip: Positive = 1.0
-    """Largest norm of the gradient."""
+    """Share of the steps over which the learning rate rises."""
+    clip: Weight = 1.0
+    """Largest norm of the gradient; 0 leaves it as it is."""
     eta_same_plane: Inner = 0.86
     eta_on: Inner = 0.66
     """Weight of the relevant objects in the loss (the paper's)."""
@@ -106,15 +122,26 @@ class TrainConfig:
 
     @classmethod
     def paper(cls) -> Self:
-        """The paper's ViT, loss weights and batch of 50; wants far more than a laptop."""
+        """The paper's ViT by its bare recipe: Adam at 1e-5 on batches of 50 queries, nothing else.
+
+        For its network for `on`, give `--predicates on`; for its other bodies, `--model.body`.
+        """
         return cls(
             preset="paper",
             model=BODIES["vit"].config.paper(),
+            predicates=tuple(p.name for p in PREDICATES.values() if p.family == "same-plane"),
             steps=500_000,
-            scenes_per_batch=50,
+            queries_per_batch=50,
+            share_encodings=False,
+            goal_objects=False,
             learning_rate=1e-5,
             betas=(0.9, 0.999),
-            share_encodings=False,
+            weight_decay=0.0,
+            schedule="constant",
+            warmup=0.0,
+            clip=0.0,
+            mask_weight=0.0,
+            geometry_weight=0.0,
             mirror=False,
             recolor=False,
         )

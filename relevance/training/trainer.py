@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from relevance.errors import RelevanceError
 from relevance.metrics import accuracy
 from relevance.models import RelevanceModel
 from relevance.scene import PREDICATES
@@ -26,6 +28,7 @@ from relevance.training.checkpoints import (
     CheckpointError,
     checkpoint_id,
     data_hash,
+    find_checkpoint,
     load_checkpoint,
     pick_device,
     read_file,
@@ -33,17 +36,23 @@ from relevance.training.checkpoints import (
     write_file,
     write_row,
 )
-from relevance.training.examples import Examples, draw_batch, gather, load_examples
+from relevance.training.examples import Examples, draw_batches, gather, load_examples
 from relevance.training.losses import batch_loss
 from relevance.training.settings import TrainConfig
 
 Progress = Callable[[int, int], None]
 
 
+class TrainingError(RelevanceError):
+    """A run that cannot go on: says at which step, on which scenes."""
+
+
 class Trainer:
     """Model, optimiser and schedule of one run; `step` does one optimiser step."""
 
-    def __init__(self, config: TrainConfig, examples: Examples) -> None:
+    def __init__(
+        self, config: TrainConfig, examples: Examples, start: RelevanceModel | None = None
+    ) -> None:
         self.config, self.examples = config, examples
         self.done = 0
         """Steps that were taken."""
@@ -54,11 +63,18 @@ class Trainer:
         self._sums: dict[str, float] = {}
         self.device = pick_device(config.device)
         # Weights are drawn before they move: equal ones on every device.
+        learned = trained_predicates(examples, config)
+        known = start.predicates if start else ()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.model = RelevanceModel(config.model, trained_predicates(examples, config))
+            self.model = RelevanceModel(config.model, (*known, *learned))
+        if start:
+            self.model.load_state_dict({**self.model.state_dict(), **start.state_dict()})
+            for name, weight in self.model.named_parameters():
+                # What belongs to a predicate alone has its name in its own.
+                weight.requires_grad_(not set(learned).isdisjoint(name.split(".")))
         self.model.to(self.device)
-        weights = list(self.model.parameters())
+        weights = [weight for weight in self.model.parameters() if weight.requires_grad]
         # Biases, norms and embeddings are not pulled towards zero.
         groups = [
             {"params": [w for w in weights if w.ndim >= 2], "weight_decay": config.weight_decay},
@@ -68,10 +84,12 @@ class Trainer:
         self.bfloat16 = use_bfloat16(config.bfloat16, self.device)
 
     def rate(self, step: int) -> float:
-        """Learning rate of a step: linear warm-up, then a cosine to zero."""
+        """Learning rate of a step: linear warm-up, then a cosine to zero or no change."""
         rise = max(1.0, self.config.warmup * self.config.steps)
         if step < rise:
             return self.config.learning_rate * (step + 1) / rise
+        if self.config.schedule == "constant":
+            return self.config.learning_rate
         share = (step - rise) / max(1.0, self.config.steps - rise)
         return self.config.learning_rate * 0.5 * (1 + float(np.cos(np.pi * min(1.0, share))))
 
@@ -81,12 +99,22 @@ class Trainer:
         self.model.train()
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate(self.done)
-        batch = draw_batch(self.examples, self.config, self.done).to(self.device)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-            parts = batch_loss(self.model, batch, self.config)
+        batches = draw_batches(self.examples, self.config, self.done)
+        found = []
+        for batch in batches:
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
+                found.append(batch_loss(self.model, batch.to(self.device), self.config))
+        parts = {name: torch.stack([part[name] for part in found]).mean() for name in found[0]}
+        if not torch.isfinite(parts["loss"]):
+            names = ", ".join(name for batch in batches for name in batch.names)
+            raise TrainingError(
+                f"step {self.done}: the loss is {float(parts['loss'].detach())} on scenes {names}; "
+                "expected a number (a lower learning rate, or other data)"
+            )
         self.optimizer.zero_grad(set_to_none=True)
         parts["loss"].backward()
-        torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip)
+        if self.config.clip:
+            torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip)
         self.optimizer.step()
         self.done += 1
         self.seconds += time.perf_counter() - start
@@ -170,12 +198,22 @@ def train(
             f"{dataset.path}: no labels with split train and policy {config.policy}, "
             "expected at least one labelled goal"
         )
+    if config.predicates and (lacking := set(config.predicates) - {p.name for p in examples.goals}):
+        raise DatasetError(
+            f"{dataset.path}: no labels of {min(lacking)} with split train and policy "
+            f"{config.policy}, which the settings ask for"
+        )
+    start = _start(dataset, config, examples)
     with _threads(config.threads):
-        trainer = Trainer(config, examples)
+        trainer = Trainer(replace(config, model=start.config) if start else config, examples, start)
         if unfinished.exists():
             trainer.resume(read_file(unfinished, "state", trainer.device))
         while trainer.done < config.steps:
-            trainer.step()
+            try:
+                trainer.step()
+            except TrainingError:
+                write_file(unfinished, "state", trainer.state())  # as it was before the step
+                raise
             if progress:
                 progress(trainer.done, config.steps)
             if trainer.done % config.save_every == 0 and trainer.done < config.steps:
@@ -185,7 +223,7 @@ def train(
         metrics = measure(trainer.model, trainer.examples)
     meta = {
         "checkpoint_id": name,
-        "config": config.to_dict(),
+        "config": trainer.config.to_dict(),
         "config_hash": config.content_hash,
         "dataset_hash": data_hash(dataset, config),
         "created": datetime.now(UTC).isoformat(),
@@ -201,6 +239,21 @@ def train(
     return path
 
 
+def _start(dataset: Dataset, config: TrainConfig, examples: Examples) -> RelevanceModel | None:
+    """The model whose weights stay; raises CheckpointError where nothing new would be learned."""
+    if not config.start:
+        return None
+    model, meta = load_checkpoint(find_checkpoint(dataset.path, config.start))
+    if meta["checkpoint_id"] != config.start:
+        raise CheckpointError(f"start: {config.start} is no id, it holds {meta['checkpoint_id']}")
+    there = set(trained_predicates(examples, config)) & set(model.predicates)
+    if there:
+        raise CheckpointError(
+            f"start: {config.start} has a head for {min(there)}, expected new --predicates"
+        )
+    return model
+
+
 def _load(dataset: Dataset, split: str, config: TrainConfig, folder: Path) -> Examples:
     return load_examples(
         dataset,
@@ -208,6 +261,7 @@ def _load(dataset: Dataset, split: str, config: TrainConfig, folder: Path) -> Ex
         camera=config.model.camera,
         policy=config.policy,
         ambiguous=config.ambiguous,
+        predicates=config.predicates,
         cache_bytes=config.cache_bytes,
         folder=folder,
     )
@@ -242,7 +296,7 @@ def measure(model: RelevanceModel, examples: Examples, batch: int = 16) -> dict[
             for start in range(0, len(scenes), batch):
                 drawn = gather(examples, scenes[start : start + batch], [predicate])
                 drawn = drawn.to(model.device)
-                encoding = model.encode(drawn.image, drawn.views, drawn.present)
+                encoding = model.encode(drawn.image, drawn.views, drawn.present, drawn.geometry)
                 ((_, goals, relevant, labelled),) = drawn.turns
                 score = model.decode(encoding, predicate, goals)
                 places = torch.arange(score.shape[-1], device=score.device)

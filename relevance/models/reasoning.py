@@ -1,0 +1,85 @@
+"""Reasoning about a goal over all objects, given where they stand: the end of two bodies.
+
+Shape suffixes: B scenes, N objects (padded), G goals, D width.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from relevance.models.layers import Attention, columns, pick
+from relevance.models.poses import ANGLES, GEOMETRY
+from relevance.scene import Predicate, Robot
+
+ROBOT = Robot()
+"""Whose axes the directions of goals are: every picture was taken in front of this one."""
+GOAL_FEATURES = 3 * GEOMETRY + 2 + 2 * 8
+
+
+class Reasoning(nn.Module):
+    """Attention over the objects of a scene, each told where it stands as the goal sees it."""
+
+    def __init__(self, width: int, heads: int, layers: int, predicates: Sequence[str]) -> None:
+        super().__init__()
+        self.place = nn.Sequential(
+            nn.Linear(GOAL_FEATURES, width), nn.GELU(), nn.Linear(width, width)
+        )
+        self.predicate = nn.ParameterDict(
+            {name: nn.Parameter(torch.zeros(width)) for name in predicates}
+        )
+        self.layers = nn.ModuleList(Attention(width, heads, expansion=2) for _ in range(layers))
+
+    def forward(
+        self, tokens: Tensor, present: Tensor, geometry: Tensor, predicate: Predicate, goals: Tensor
+    ) -> Tensor:
+        """Tokens (B, G, N, D) from tokens (B, N, D) and geometry (B, N, GEOMETRY)."""
+        features = goal_features(geometry, predicate, goals)
+        x_BGND = tokens[:, None] + self.place(features) + self.predicate[predicate.name]
+        x = x_BGND.flatten(0, 1)
+        allowed = columns(present).repeat_interleave(goals.shape[1], dim=0)
+        for layer in self.layers:
+            x = layer(x, allowed)
+        return x.view(x_BGND.shape)
+
+
+def object_heads(width: int, predicates: Sequence[str]) -> nn.ModuleDict:
+    """For each predicate what makes a token (..., D) a score (..., 1)."""
+    return nn.ModuleDict(
+        {
+            name: nn.Sequential(
+                nn.LayerNorm(width), nn.Linear(width, width), nn.GELU(), nn.Linear(width, 1)
+            )
+            for name in predicates
+        }
+    )
+
+
+def goal_features(geometry: Tensor, predicate: Predicate, goals: Tensor) -> Tensor:
+    """Where every object is as the goal sees it, (B, G, N, GOAL_FEATURES).
+
+    Axes: along and across the predicate's direction (x and y for `on`). Own geometry, the
+    subject's, the reference's, two role flags, and for subject and reference the distance
+    and the signed clearance of the footprints along both axes: what "beside" turns on.
+    """
+    u = predicate.direction(ROBOT) or (1.0, 0.0)
+    axes = geometry.new_tensor([[u[0], u[1]], [-u[1], u[0]]])
+    # Extents along the goal's axes: those of the regressed directions that are nearest.
+    turn = round(math.atan2(u[1], u[0]) / (math.pi / ANGLES))
+    extents = geometry[..., 6:].roll(-turn, dims=-1)
+    place = torch.cat([geometry[..., :2] @ axes.T, geometry[..., 2:6], extents], dim=-1)
+    objects, count = place.shape[1], goals.shape[1]
+    own = place[:, None].expand(-1, count, -1, -1)
+    roles = torch.arange(objects, device=goals.device)[:, None] == goals[..., None, :]
+    features = [own, roles.to(place.dtype)]
+    for role in range(2):
+        anchor = pick(place, goals[..., role])[:, :, None]
+        delta = own[..., :3] - anchor[..., :3]
+        reach = (own + anchor)[..., [6, 6 + ANGLES // 2]]
+        apart = delta[..., :2].abs()
+        clear = apart - reach
+        features += [anchor.expand_as(own), delta, apart, clear, clear.amax(-1, keepdim=True)]
+    return torch.cat(features, dim=-1)

@@ -1,0 +1,92 @@
+"""The paper's 3D-ResNet: the patches of the image stacked with the three views, convolved.
+
+Everything meets from the first layer on, so nothing is shared between queries.
+
+Shape suffixes: B scenes, N objects (padded), G goals, T trios of subject, reference and query,
+P image patches, D width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Literal, Self
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from relevance.configs import config
+from relevance.models.config import PATCH, Encoding, ModelConfig
+from relevance.models.layers import Extractor, each_trio, extractor, pick_trios, residual
+from relevance.models.registry import BODIES, Body, BodyKind
+from relevance.scene import Predicate
+
+_AT_ONCE = 32
+"""Trios of a scene that are convolved at once, to bound the memory."""
+
+
+@config
+class Resnet3dConfig(ModelConfig):
+    """Depth and widths; by default what a CPU can train. The paper names none."""
+
+    body: Literal["resnet3d"] = "resnet3d"
+    """The body that these settings are of."""
+    blocks: Annotated[
+        tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1, max_length=4)
+    ] = (1, 1, 1)
+    """Residual blocks of each stage; each stage halves stack and pictures."""
+    channels: Annotated[int, Field(ge=8, multiple_of=8)] = 8
+    """Channels of the first stage; each stage doubles them."""
+    width: Annotated[int, Field(ge=1)] = 128
+    """D, width of the embeddings of subject, reference and query."""
+    hidden: Annotated[int, Field(ge=1)] = 512
+    """Width of the two hidden layers of each predicate's extractor (the paper's)."""
+
+    @classmethod
+    def smoke(cls) -> Self:
+        """The smallest that runs."""
+        return cls(blocks=(1,), width=16, hidden=32)
+
+    @classmethod
+    def paper(cls) -> Self:
+        """The usual size of 18 layers, the ViT's width."""
+        return cls(blocks=(2, 2, 2, 2), channels=64, width=768)
+
+
+class Resnet3dBody(Body):
+    """One 3D ResNet, a dense layer to three embeddings, an extractor for each predicate."""
+
+    def __init__(self, config: Resnet3dConfig, predicates: Sequence[str]) -> None:
+        super().__init__()
+        self.width = config.width
+        self.net, channels = residual(3, config.blocks, config.channels)
+        self.dense = nn.Linear(channels, 3 * config.width)
+        self.heads = nn.ModuleDict(
+            {name: Extractor(config.width, config.hidden) for name in predicates}
+        )
+
+    def encode(
+        self, image: Tensor, views: Tensor, present: Tensor, poses: Tensor | None
+    ) -> Encoding:
+        """As `RelevanceModel.encode`, pictures float in 0..1; only cuts the patches out."""
+        patches = F.unfold(image - 0.5, PATCH, stride=PATCH).transpose(1, 2)
+        return Encoding(tokens=(views - 0.5).flatten(2), present=present, scene=patches)
+
+    def decode(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
+        """As `RelevanceModel.decode`."""
+        patches_BPX = encoding.scene
+        assert patches_BPX is not None
+
+        def score(trios_BT3: Tensor) -> Tensor:
+            views = pick_trios(encoding.tokens, trios_BT3)
+            patches = patches_BPX[:, None].expand(-1, views.shape[1], -1, -1)
+            stack = torch.cat([patches, views], dim=2).flatten(0, 1)
+            pictures = stack.unflatten(-1, (3, PATCH, PATCH)).transpose(1, 2)
+            dense = F.relu(self.dense(self.net(pictures))).unflatten(-1, (3, self.width))
+            return extractor(self.heads, predicate.name).of_trios(dense).view(views.shape[:2])
+
+        return each_trio(score, goals, encoding.tokens.shape[1], _AT_ONCE)
+
+
+BODIES.register("resnet3d", BodyKind(config=Resnet3dConfig, make=Resnet3dBody, version="1"))
