@@ -38,7 +38,7 @@ WITH queries AS (
     GROUP BY plan_id
 )
 SELECT
-    CASE p.predicate WHEN 'on' THEN 'on' ELSE 'same-plane' END AS family,
+    s.family,
     s.n_objects,
     count(*) AS goals,
     count(*) FILTER (p.holds) / count(*) AS plan_share,

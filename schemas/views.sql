@@ -42,8 +42,8 @@ FROM summed
 ORDER BY predicate, split, policy;
 
 -- The paper's table of label distribution: per predicate and split, over all plans
--- (n_actions = 'all') and by length of the plan. predicate = 'same-plane' sums its four
--- predicates. Goals without a plan have no length, so only 'all' counts them.
+-- (n_actions = 'all') and by length of the plan. predicate = 'same-plane' sums those of that
+-- family; one that is named as a predicate has no sum. Goals without a plan have no length, so only 'all' counts them.
 CREATE OR REPLACE VIEW paper_label_distribution AS
 WITH queries AS (
     SELECT plan_id, count(*) AS queries, count(*) FILTER (relevant) AS relevant
@@ -53,12 +53,13 @@ WITH queries AS (
 ),
 goals AS (
     SELECT
-        CASE p.predicate WHEN 'on' THEN 'on' ELSE 'same-plane' END AS family,
-        p.predicate, p.split,
+        s.family, p.predicate, p.split,
         CASE WHEN p.status = 'solved' THEN p.n_actions END AS n_actions,
         p.status = 'solved' AS solved, p.holds,
         coalesce(q.queries, 0) AS queries, coalesce(q.relevant, 0) AS relevant
-    FROM plans AS p LEFT JOIN queries AS q USING (plan_id)
+    FROM plans AS p
+    JOIN scenes AS s USING (scene_id)
+    LEFT JOIN queries AS q USING (plan_id)
 ),
 grouped AS (
     SELECT
@@ -77,7 +78,7 @@ SELECT
     predicate, split, n_actions, goals, solved, plans, queries, relevant,
     relevant / nullif(queries, 0) AS relevant_share
 FROM grouped
-WHERE n_actions IS NOT NULL AND (family <> 'on' OR is_family = 0)
+WHERE n_actions IS NOT NULL AND (is_family = 0 OR family NOT IN (SELECT predicate FROM plans))
 ORDER BY predicate, split, n_actions <> 'all', length(n_actions), n_actions;
 
 -- How long the plans are.

@@ -158,12 +158,12 @@ def test_a_guide_registered_from_outside_guides():
 
 
 def test_every_planner_answers_in_one_way():
-    assert list(PLANNERS) == ["ours", "rai"]
+    assert {"ours", "rai"} <= set(PLANNERS)
     ours = PLANNERS["ours"]
     ours.require()
     result = ours.plan(OPEN, "on(red, blue)", config=ours.Config(node_limit=100))
     assert result.status == "solved"
-    with pytest.raises(RelevanceError, match="unknown planner 'theirs', expected one of ours, rai"):
+    with pytest.raises(RelevanceError, match=r"unknown planner 'theirs', expected one of .*ours"):
         PLANNERS["theirs"]
 
 

@@ -1,5 +1,5 @@
--- Label distribution of one split: a row a predicate, `same-plane` sums its four.
+-- Label distribution of one split: a row a predicate, a family sums its own.
 SELECT predicate, goals, solved, plans, queries, relevant, relevant_share
 FROM paper_label_distribution
 WHERE split = $split AND n_actions = 'all'
-ORDER BY predicate <> 'same-plane', predicate = 'on', predicate;
+ORDER BY predicate IN (SELECT predicate FROM plans), predicate;

@@ -61,7 +61,7 @@ def _plan(_: Preset) -> Callable[..., int]:
         at_least("--max-actions", max_actions, 2)
         at_least("--seconds", seconds, 0.001)
         at_least("--beta", beta, -math.inf)
-        if (guide == "none") != (checkpoint is None):
+        if GUIDES[guide].guided != (checkpoint is not None):
             raise UsageError("--guide and --checkpoint go together: a guide needs a model")
         chosen = PLANNERS[planner]
         chosen.require()

@@ -68,7 +68,7 @@ class EvaluationConfig:
 
     @model_validator(mode="after")
     def _guides(self) -> EvaluationConfig:
-        allowed = [name for name in GUIDES if name != "none"]
+        allowed = [name for name, mode in GUIDES.items() if mode.guided]
         for guide in self.guides:
             if guide not in allowed:
                 raise ValueError(f"unknown guide {guide!r}, expected one of {', '.join(allowed)}")

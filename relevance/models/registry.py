@@ -61,11 +61,11 @@ BODIES: Registry[BodyKind] = Registry("body")
 class RelevanceModel(nn.Module):
     """Scores objects for goals; positive means relevant (CONTRIBUTING, The words)."""
 
-    def __init__(self, config: ModelConfig, predicates: Sequence[str] = tuple(PREDICATES)) -> None:
+    def __init__(self, config: ModelConfig, predicates: Sequence[str] | None = None) -> None:
         super().__init__()
         self.config = config
-        self.predicates = tuple(predicates)
-        """Names of the predicates that it has a head for."""
+        self.predicates = tuple(PREDICATES if predicates is None else predicates)
+        """Names of the predicates that it has a head for (None: all that there are)."""
         self.body = BODIES[config.body].make(config, self.predicates)
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from relevance.report import plots
-from relevance.report.style import GROUPS
+from relevance.report.style import GROUPS, groups
 from relevance.scene import PREDICATES
 from relevance.store import SPLITS
 
@@ -22,7 +22,8 @@ def data_section(rows: Any) -> dict[str, Any]:
         """
         select predicate, sum(queries)::bigint as queries,
             sum(relevant) / nullif(sum(queries), 0) as relevant_share
-        from paper_label_distribution where n_actions = 'all' and predicate <> 'same-plane'
+        from paper_label_distribution
+        where n_actions = 'all' and predicate in (select predicate from plans)
         group by predicate
         """
     )
@@ -57,7 +58,7 @@ def data_section(rows: Any) -> dict[str, Any]:
 
 
 def _in_order(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    order = ["same-plane", *PREDICATES]
+    order = groups()
     return sorted(rows, key=lambda r: (order.index(r["predicate"]), SPLITS.index(r["split"])))
 
 
@@ -98,9 +99,9 @@ def planner_section(rows: Any) -> dict[str, Any]:
     )
     families = rows(
         """
-        select case predicate when 'on' then 'on' else 'same-plane' end as family,
-            count(*) as n, quantile_cont(seconds, $1::double[]) as quantiles
-        from timings group by family order by family desc
+        select family, count(*) as n, quantile_cont(seconds, $1::double[]) as quantiles
+        from timings join plans using (plan_id) join scenes using (scene_id)
+        group by family order by family desc
         """,
         plots.QUANTILES.tolist(),
     )

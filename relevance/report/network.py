@@ -12,7 +12,7 @@ from relevance.evaluation import Predictions, read_predictions, unjudged
 from relevance.metrics import Accuracy
 from relevance.report import plots
 from relevance.report.style import GROUPS
-from relevance.scene import PREDICATES
+from relevance.report.style import groups as shown_groups
 from relevance.store import Dataset
 
 
@@ -37,7 +37,7 @@ def network_section(
     if predictions is None or not len(predictions):
         return model
     everything = read_predictions(dataset, str(chosen))
-    groups = [g for g in ("same-plane", *PREDICATES) if len(predictions.of(g))]
+    groups = [g for g in shown_groups() if len(predictions.of(g))]
     model["accuracies"] = [(group, predictions.of(group).accuracy()) for group in groups]
     model["with_goal_objects"] = [(group, everything.of(group).accuracy()) for group in groups]
     model["tuned"] = _tuned(predictions, groups, model["chosen"])

@@ -200,7 +200,7 @@ def beta_accuracy(*axes: Axes, predictions: Predictions) -> None:
         ax.axvline(0, color=FAINT, linewidth=1)
         ax.set_ylim(0, 1.02)
         _percent_axis(ax.yaxis)
-    axes[0].legend(loc="lower left")
+    max(axes, key=lambda ax: len(ax.lines)).legend(loc="lower left")
 
 
 def scores(*axes: Axes, predictions: Predictions) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from relevance.planner import GUIDES
-from relevance.scene import FAMILIES
+from relevance.scene import FAMILIES, PREDICATES
 
 GROUPS = FAMILIES
 """Families, in the order in which tables and plots show them."""
@@ -55,6 +55,11 @@ def guide_style(name: str) -> GuideStyle:
     if name not in GUIDES:
         return GuideStyle(color=_spare(name), complete=False)
     return GuideStyle(color=GUIDES[name].color, complete=GUIDES[name].complete)
+
+
+def groups() -> list[str]:
+    """Rows of tables, in order: families, then predicates; a name of both comes once."""
+    return [*(family for family in FAMILIES if family not in PREDICATES), *PREDICATES]
 
 
 def family_color(name: str) -> str:

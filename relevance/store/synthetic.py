@@ -7,12 +7,12 @@ from pathlib import Path
 
 import duckdb
 
+from relevance.scene import PREDICATES
 from relevance.store.dataset import Dataset
 from relevance.store.parquet import to_parquet
 from relevance.store.paths import replacing
 from relevance.store.tables import table_schema
 
-PREDICATES = ("on-the-left", "on-the-right", "in-front", "behind", "on")
 OBJECTS = 7
 """Label rows a plan."""
 
