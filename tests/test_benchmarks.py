@@ -286,7 +286,7 @@ def test_against_lists_the_tasks_in_which_the_peer_does_better(tasks):
     """Ours may take too few actions here: the peer solves what ours leaves, in both kinds."""
     short = PlannerConfig(max_actions=2)
     hard = find_unsolved(2, 1, config=short)
-    assert [plan(task.scene, task.goal, config=short).status for task in hard] == ["infeasible"] * 2
+    assert all(plan(task.scene, task.goal, config=short).status != "solved" for task in hard)
     measured = measure_against(tasks[:2], plan, name="other", unsolved=hard, config=short)
     assert [row.kind for row in measured.rows] == ["random"] * 2 + ["unsolved"] * 2
     beaten = [row for row in measured.rows if row.status != "solved" and row.replay_ok_peer]

@@ -21,6 +21,7 @@ FEW = {
 }
 
 
+@pytest.mark.slow  # a pipeline is killed and started anew three times
 def test_three_kills_change_no_byte(tmp_path: Path) -> None:
     fewer = FEW | {"train.on": 4, "test.on": 2}
     trials = disturb(tmp_path, fewer, kills=3, seed=0, flows=False, workers=1, longest=2.0)

@@ -90,6 +90,7 @@ def _task(function: Callable[..., Any]) -> Any:
     return task(function, retries=1, retry_condition_fn=worth_retrying, cache_policy=NO_CACHE)
 
 
+@pytest.mark.slow  # three pools of processes start
 def test_results_come_by_name_and_a_dead_worker_costs_a_new_pool(
     prefect_server: None, tmp_path: Path
 ) -> None:
@@ -270,7 +271,7 @@ def test_another_policy_is_a_parameter(dataset: Path) -> None:
     assert (made["shards"], made["written"]) == (3, 3)
     assert [of.policy for of in Dataset.open(dataset).labellings()] == ["any-minimal"]
     assert {name: c for name, c in _bytes(dataset).items() if name in before} == before
-    with pytest.raises(RelevanceError, match="policy 'guess': expected one of found, nec"):
+    with pytest.raises(RelevanceError, match="unknown policy 'guess', expected one of found, nec"):
         label(dataset=str(dataset), policy="guess")
 
 

@@ -93,6 +93,7 @@ def bucket() -> Iterator[str]:
                 os.environ[name] = value
 
 
+@pytest.mark.slow  # a server of objects, and a whole dataset in it
 def test_an_object_store_holds_the_same_bytes(bucket: str, calm: Path) -> None:
     root = f"{bucket}/one"
     complete(root)

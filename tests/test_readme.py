@@ -122,7 +122,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder as the pages have it: a tiny dataset as data/demo, a checkpoint, a scene."""
     root = tmp_path_factory.mktemp("project")
     few = [f"--{split}.on=2" for split in ("train", "validation", "test")]
-    few += [f"--{split}.same-plane=0" for split in ("train", "validation", "test")]
+    few += ["--train.same-plane=1", "--validation.same-plane=1", "--test.same-plane=0"]
     for name, seed in (("demo", 0), ("more", 1)):
         made = ["generate", str(root / "data" / name), "--preset=smoke", *few, f"--seed={seed}"]
         assert main([*made, "--goals-per-scene=1", "--workers=1"]) == 0
