@@ -203,6 +203,9 @@ class _Run:
             self._put(box.name, box.position, (0.0, 0.0, math.sin(half), math.cos(half)))
         self.held: str | None = None
         self.T_hand_box: tuple[Sequence[float], Sequence[float]] = ((0, 0, 0), (0, 0, 0, 1))
+        self.given: dict[str, float] = {}
+        """How deep the held box was in others when it was taken, m, less once it left them: a
+        scene may sink a box up to its tolerance, and no plan is to blame for that."""
         self.deepest = 0.0
         self.culprit = ""
         self.where = ""
@@ -308,6 +311,14 @@ class _Run:
                 f"{self.where}: a closed finger is {1000 * off:.1f} mm off the box's face"
             )
         self.held = name
+        self.given = {
+            other: max(0.0, -self.arena.distance(self.body[name], body))
+            for other, body in self._others(name)
+        }
+
+    def _others(self, name: str) -> list[tuple[str, int]]:
+        """Every box but one, and the table, with their bodies."""
+        return [(o, self.body[o]) for o in self.names if o != name] + [("table", self.table)]
 
     def _between_fingers(self, name: str) -> tuple[float, float]:
         """Where the line through both finger pads enters and leaves a box, y in hand frame."""
@@ -397,13 +408,14 @@ class _Run:
         if held is None:
             return
         mine = bounds[held]
-        for name in self.names:
-            if name != held and _touch(mine, bounds[name]):
-                depth = -arena.distance(self.body[held], self.body[name])
-                self._record(depth, held, name)
-        if mine[0][2] < 0:
-            depth = -arena.distance(self.body[held], self.table)
-            self._record(depth, held, "table")
+        for name, body in self._others(held):
+            if mine[0][2] < 0 if name == "table" else _touch(mine, bounds[name]):
+                depth = -arena.distance(self.body[held], body)
+                given = self.given.get(name, 0.0)
+                self._record(depth - given, held, name)
+                self.given[name] = min(given, max(0.0, depth))
+            else:
+                self.given[name] = 0.0
 
     def _record(self, depth: float, a: str, b: str) -> None:
         self.deepest = max(self.deepest, depth)

@@ -1,0 +1,86 @@
+"""Scenes that were once planned wrongly, each with the right answer; the replay judges every plan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from relevance.evaluation.scorer import same_view
+from relevance.planner import PlannerConfig, PlanResult, plan
+from relevance.scene import Camera, Scene, read_scenes
+
+CASES = Path(__file__).parent / "cases"
+
+
+def scene_of(name: str) -> Scene:
+    """The first scene of a file."""
+    return read_scenes(next(CASES.glob(f"{name}.json*")))[0]
+
+
+def planned(name: str, **settings) -> PlanResult:
+    """The first goal of a file's first scene, planned and replayed."""
+    scene = scene_of(name)
+    return plan(scene, scene.goals[0], config=PlannerConfig(**settings))
+
+
+@pytest.mark.parametrize(
+    ("name", "moved"),
+    [
+        ("hand-1", ("b2", "b0")),  # a shallower hold than 25 mm
+        ("low-tray", ("tray",)),
+        ("thin-pad", ("cube",)),
+        ("thin-pad-3mm", ("cube",)),
+        ("sunk-0.5mm", ("a",)),
+        ("sunk-0.6mm", ("a",)),
+        ("sunk-0.8mm", ("a",)),
+        ("other-side", ("a",)),
+    ],
+)
+def test_what_a_hand_can_take_is_moved_and_nothing_else(name: str, moved: tuple[str, ...]) -> None:
+    result = planned(name)
+    assert result.status == "solved", result.reason
+    assert result.moved == moved
+    assert result.replay is not None
+    assert result.replay.ok
+
+
+@pytest.mark.parametrize("name", [*(f"tree-solves-{n}" for n in range(1, 13)), "informed-misses"])
+def test_the_informed_search_loses_nothing_that_the_tree_solves(name: str) -> None:
+    informed, tree = planned(name), planned(name, search="tree")
+    assert (informed.status, tree.status) == ("solved", "solved")
+    assert len(informed.moved) == len(tree.moved)
+
+
+def test_mirror_images_have_mirrored_answers_or_are_flagged() -> None:
+    one, other = planned("mirror-solved"), planned("mirror-infeasible")
+    assert one.status == other.status == "solved"
+    assert {*one.moved} == {*other.moved} or one.ambiguous or other.ambiguous
+
+
+def test_a_whole_turn_changes_no_answer() -> None:
+    turned, plain = planned("turned"), planned("not-turned")
+    assert (turned.status, turned.moved) == (plain.status, plain.moved)
+
+
+def test_no_says_what_stands_in_the_way() -> None:
+    result = planned("moved-twice")
+    assert (result.status, result.blocking) == ("infeasible", ("t2",))
+    assert "twice" in result.reason
+
+
+def test_a_goal_that_holds_already_takes_no_action() -> None:
+    result = planned("already-true")
+    assert (result.status, result.actions, result.moved) == ("solved", (), ())
+
+
+def test_an_arm_goes_around_a_pole_or_says_that_it_found_no_way() -> None:
+    """Every link is looked at: a plan that is called solved does replay."""
+    result = planned("tall-pole")
+    assert result.status in ("solved", "limit")
+    assert (result.replay is not None and result.replay.ok) or "undecided" in result.reason
+
+
+def test_a_camera_that_looks_elsewhere_is_not_the_models() -> None:
+    assert not same_view(scene_of("looks-away").camera, Camera())
+    assert same_view(scene_of("same").camera, Camera())
