@@ -1,4 +1,4 @@
-"""Scenes that were once planned wrongly, each with the right answer; the replay judges every plan."""
+"""Scenes that were once planned wrongly, with the right answers; the replay judges every plan."""
 
 from __future__ import annotations
 
