@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, dataclass_transform, get_type_hints
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
@@ -33,6 +33,11 @@ def config(cls: C) -> C:
 
     A rule about several fields is a `model_validator(mode="after")` that raises ValueError.
     """
+    return checked(cls, lambda error: ConfigError(f"{cls.__name__}{first_error(error)}"))
+
+
+def checked(cls: C, refuse: Callable[[ValidationError], RelevanceError]) -> C:
+    """A frozen dataclass of a class whose fields pydantic checks; `refuse` words what it found."""
     made: Any = dataclass(
         cls,
         frozen=True,
@@ -47,7 +52,7 @@ def config(cls: C) -> C:
         try:
             check(self, *args, **kwargs)
         except ValidationError as error:
-            raise ConfigError(f"{cls.__name__}{first_error(error)}") from None
+            raise refuse(error) from None
 
     made.__init__ = __init__
     return made

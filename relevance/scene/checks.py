@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-from typing import Any, TypeVar, dataclass_transform
+from typing import TypeVar, dataclass_transform
 
-from pydantic import ConfigDict, Field, ValidationError
-from pydantic.dataclasses import dataclass
+from pydantic import Field, ValidationError
 
+from relevance import configs
 from relevance.errors import RelevanceError
 from relevance.scene.words import shown
 
@@ -27,19 +26,7 @@ def checked(cls: C) -> C:
 
     Fields that are unknown, of another type, NaN or infinite are refused with a SceneError.
     """
-    config = ConfigDict(extra="forbid", allow_inf_nan=False)
-    made: Any = dataclass(cls, frozen=True, slots=True, kw_only=True, config=config)
-    check = made.__init__
-
-    @functools.wraps(check)
-    def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
-        try:
-            check(self, *args, **kwargs)
-        except ValidationError as error:
-            raise SceneError(f"{cls.__name__}: {first_error(error)}") from None
-
-    made.__init__ = __init__
-    return made
+    return configs.checked(cls, lambda error: SceneError(f"{cls.__name__}: {first_error(error)}"))
 
 
 _SAID_BETTER = {
