@@ -75,6 +75,9 @@ def test_a_support_must_be_under_it_and_touch():
     for bad in ([], ["a", "a"]):
         with pytest.raises(SceneError, match="a list of distinct names"):
             plate(0.0, 0.0, bad)
+    for bad in ([[]], [None], [["a"]]):
+        with pytest.raises(SceneError, match="valid string"):
+            plate(0.0, 0.0, bad)
 
 
 def test_one_name_is_as_it_was_and_a_list_of_one_is_that_name():

@@ -41,7 +41,8 @@ def _supports(value: Any) -> Any:
         return value
     if not value or len(set(map(str, value))) < len(value):
         raise ValueError("expected null, a name or a list of distinct names")
-    return value[0] if len(value) == 1 else tuple(value)
+    alone = len(value) == 1 and isinstance(value[0], str)
+    return value[0] if alone else tuple(value)
 
 
 Support = Annotated[Name | tuple[Name, ...] | None, BeforeValidator(_supports)]
