@@ -93,7 +93,9 @@ def planner_section(rows: Any) -> dict[str, Any]:
     counts_of = {row["predicate"]: row for row in counts}
     reasons = rows(
         """
-        select status, reason, sum(goals)::bigint as goals from plan_failures group by all
+        -- what names objects differs from goal to goal; what ended the search comes last
+        select status, split_part(reason, '; ', -1) as reason, sum(goals)::bigint as goals
+        from plan_failures group by all
         order by goals desc, status, reason
         """
     )
@@ -126,8 +128,8 @@ def planner_section(rows: Any) -> dict[str, Any]:
         "reasons_plot": plots.svg(
             "reasons",
             plots.reasons,
-            size=(4.8, 0.75 + 0.3 * min(len(reasons), 12)),
-            rows=reasons[:12],
+            size=(4.8, 0.75 + 0.42 * min(len(reasons), 8)),
+            rows=reasons[:8],
         )
         if reasons
         else "",
