@@ -18,6 +18,7 @@ from conftest import CONFIG, contents, make, small_dataset, untouched
 from hypothesis import given
 from hypothesis import strategies as st
 
+from relevance import simulation
 from relevance.labels import stored_scene
 from relevance.pipeline import (
     Counts,
@@ -348,6 +349,19 @@ def test_every_solved_test_plan_is_replayed() -> None:
     assert plans
     assert all(plan["replay_ok"] is not None for plan in plans)
     assert all(plan["replay_max_penetration"] is not None for plan in plans)
+
+
+def test_only_the_drawn_share_is_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def replay(*_: object) -> None:
+        raise AssertionError("a plan was replayed that was not drawn")
+
+    monkeypatch.setattr(simulation, "replay", replay)
+    monkeypatch.setattr(labelling, "replay", replay)
+    rows = Dataset.open(small_dataset()).read_rows("scenes", split="train", shard=0)
+    config = replace(CONFIG, replay_share=0.0)
+    plans, _ = labelling._plans(config, PREDICATES["behind"], rows, None)
+    assert any(plan["status"] == "solved" for plan in plans)
+    assert all(plan["replay_ok"] is None for plan in plans)
 
 
 def test_the_replayed_share_is_a_share() -> None:

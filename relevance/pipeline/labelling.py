@@ -192,7 +192,7 @@ def _plans(
         drawn_by, count = config.drawn_by, config.goals_per_scene
         goals = sample_goals(scene, predicate, count, seed=drawn_by, config=config.goals)
         for goal in goals:
-            result = plan(scene, goal, config=config.planner)
+            result = plan(scene, goal, config=config.planner, replay=False)
             verdict, seconds = None, None
             if result.status == "solved" and _chosen(scene.id, str(goal), share):
                 started = time.perf_counter()
