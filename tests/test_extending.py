@@ -73,7 +73,7 @@ class MeanBody(Body):
     def encode(self, image, views, present, poses):
         return Encoding(tokens=self.embed(views.mean(dim=(-2, -1))), present=present)
 
-    def decode(self, encoding, predicate, goals):
+    def decode(self, encoding, predicate, goals, asked):
         scores = self.heads[predicate.name](encoding.tokens)[..., 0]
         return scores[:, None].expand(-1, goals.shape[1], -1)
 

@@ -414,7 +414,11 @@ def test_a_body_is_registered_from_outside() -> None:
             return Encoding(tokens=views.mean((-1, -2)), present=present)
 
         def decode(
-            self, encoding: Encoding, predicate: Predicate, goals: torch.Tensor
+            self,
+            encoding: Encoding,
+            predicate: Predicate,
+            goals: torch.Tensor,
+            asked: torch.Tensor,
         ) -> torch.Tensor:
             score = self.heads[predicate.name](encoding.tokens)[..., 0]
             return score[:, None].expand(-1, goals.shape[1], -1)

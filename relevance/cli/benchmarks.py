@@ -1,4 +1,4 @@
-"""The subcommands `bench planner` and `bench dataset`."""
+"""The subcommands `bench planner`, `bench dataset` and `bench training`."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import os
@@ -10,13 +10,14 @@ from typing import Annotated, Literal
 
 import tyro
 
-from relevance.cli.arguments import Command, Preset, at_least
+from relevance.cli.arguments import Command, Preset, at_least, one_of
 from relevance.cli.bench import bench_planner, hand_over
 from relevance.cli.terminal import bar, say
 
 Part = Literal["making", "reading", "queries", "crashes"]
 PARTS: tuple[Part, ...] = ("making", "reading", "queries", "crashes")
 OptionalSeed = Annotated[int | None, tyro.conf.arg(metavar="N")]
+Bodies = Annotated[tuple[str, ...], tyro.conf.arg(metavar="BODY")]
 OptionalFolder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")]
 
 
@@ -81,6 +82,70 @@ def _bench(_: Preset) -> Callable[..., int]:
     return bench
 
 
+def _training(_: Preset) -> Callable[..., int]:
+    from relevance.training import TrainConfig
+
+    def bench(
+        sizes: tuple[Literal["cpu", "paper"], ...] = ("cpu",),
+        bodies: Bodies = (),
+        scenes: int = 4,
+        goals: int = 4,
+        objects: int = 10,
+        queries: int = 50,
+        seconds: float = 2.0,
+        device: str = TrainConfig().device,
+        bfloat16: Literal["auto", "on", "off"] = TrainConfig().bfloat16,
+        out: OptionalFolder = None,
+    ) -> int:
+        """Measure how fast every body trains and looks, on made-up pictures.
+
+        Queries a second are given twice: with one encoding of a scene for all its goals where
+        the body can share it, and with an encoding for every query, as in the paper. On a CPU
+        times are those of one core.
+
+        Args:
+            sizes: Widths that a CPU can train, the paper's, or both.
+            bodies: Which; all when not given.
+            scenes: Of a batch.
+            goals: Of each scene.
+            objects: In each scene; each is asked about in every goal.
+            queries: Of a batch that encodes each alone.
+            seconds: How long each of a body's three measurements goes on.
+            device: Where; auto is the accelerator if there is one.
+            bfloat16: As of `relevance train`.
+            out: Folder for the table's rows as CSV; data/bench/training when not given.
+        """
+        from relevance.benchmarks.training import measure_training
+        from relevance.models import BODIES, unequal
+
+        for flag, count in (("scenes", scenes), ("goals", goals), ("queries", queries)):
+            at_least(f"--{flag}", count, 1)
+        at_least("--objects", objects, 3)
+        at_least("--seconds", seconds, 0)
+        for body in bodies:
+            one_of("--bodies", body, BODIES)
+        folder = out or Path("data/bench/training")
+        folder.mkdir(parents=True, exist_ok=True)
+        with bar("bodies") as progress:
+            measured = measure_training(
+                TrainConfig(device=device, bfloat16=bfloat16),
+                sizes=sizes,
+                bodies=bodies,
+                scenes=scenes,
+                goals=goals,
+                objects=objects,
+                queries=queries,
+                seconds=seconds,
+                progress=progress,
+            )
+        hand_over(measured, folder)
+        for line in unequal(bodies or BODIES):
+            print(line)
+        return 0
+
+    return bench
+
+
 COMMANDS = {
     "bench planner": Command(
         make=bench_planner,
@@ -98,6 +163,14 @@ COMMANDS = {
             "relevance bench dataset",
             "relevance bench dataset --parts making --scenes 80",
             "relevance bench dataset --parts crashes --kills 40",
+        ),
+    ),
+    "bench training": Command(
+        make=_training,
+        about="how fast every body trains and looks",
+        examples=(
+            "relevance bench training",
+            "relevance bench training --sizes paper --device cuda --scenes 16 --seconds 20",
         ),
     ),
 }

@@ -36,6 +36,7 @@ from relevance.models.registry import (
     BodyKind,
     RelevanceModel,
     model_config,
+    unequal,
 )
 
 for _module in iter_modules(__path__):
@@ -60,4 +61,5 @@ __all__ = [
     "mirrored",
     "model_config",
     "true_geometry",
+    "unequal",
 ]

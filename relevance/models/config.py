@@ -44,6 +44,10 @@ class ModelConfig:
             )
         return self
 
+    def readings(self) -> dict[str, Self]:
+        """The ways in which the paper's description of the body can be read, by name."""
+        return {"": self}
+
     @classmethod
     def smoke(cls) -> Self:
         """The smallest that runs; the defaults where a body does not say."""

@@ -51,6 +51,7 @@ class GeometryBody(Body):
     """Tokens of the poses, attention among them, then the reasoning that `glimpse` ends with."""
 
     told = True
+    among_all = True
 
     def __init__(self, config: GeometryConfig, predicates: Sequence[str]) -> None:
         super().__init__()
@@ -68,11 +69,21 @@ class GeometryBody(Body):
         tokens = self.among(self.token(poses), columns(present))
         return Encoding(tokens=tokens, present=present, geometry=poses)
 
-    def decode(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
+    def decode(
+        self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
+    ) -> Tensor:
         """As `RelevanceModel.decode`."""
         assert encoding.geometry is not None
         x = self.reason(encoding.tokens, encoding.present, encoding.geometry, predicate, goals)
         return self.heads[predicate.name](x).squeeze(-1)
 
 
-BODIES.register("geometry", BodyKind(config=GeometryConfig, make=GeometryBody, version="1"))
+BODIES.register(
+    "geometry",
+    BodyKind(
+        config=GeometryConfig,
+        make=GeometryBody,
+        version="1",
+        advantage="sees no picture: it is told the true poses of all objects",
+    ),
+)

@@ -66,6 +66,8 @@ class GlimpseBody(Body):
     direction, from the reference and from the subject.
     """
 
+    among_all = True
+
     def __init__(self, config: GlimpseConfig, predicates: Sequence[str]) -> None:
         super().__init__()
         width, channels = config.width, config.channels
@@ -135,7 +137,9 @@ class GlimpseBody(Body):
         heat = F.grid_sample(peak, grid.view(-1, PATCH, PATCH, 2), align_corners=False)
         return torch.cat([colours.reshape(-1, 3, PATCH, PATCH), heat], dim=1)
 
-    def decode(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
+    def decode(
+        self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
+    ) -> Tensor:
         """As `RelevanceModel.decode`."""
         assert encoding.geometry is not None
         x = self.reason(encoding.tokens, encoding.present, encoding.geometry, predicate, goals)
@@ -166,4 +170,12 @@ def _on_the_ground(centre: Tensor, camera: Camera) -> Tensor:
     return (eye[:2] + along * ray[..., :2]) / DECIMETRE
 
 
-BODIES.register("glimpse", BodyKind(config=GlimpseConfig, make=GlimpseBody, version="1"))
+BODIES.register(
+    "glimpse",
+    BodyKind(
+        config=GlimpseConfig,
+        make=GlimpseBody,
+        version="1",
+        advantage="sees the views of all objects, and learned from masks and poses",
+    ),
+)

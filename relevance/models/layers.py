@@ -26,12 +26,13 @@ class Attention(nn.Module):
             nn.Linear(width, expansion * width), nn.GELU(), nn.Linear(expansion * width, width)
         )
 
-    def forward(self, x: Tensor, allowed: Tensor) -> Tensor:
-        """x (B, L, D); allowed (B or 1, L, L) bool: row may look at column."""
+    def forward(self, x: Tensor, allowed: Tensor | None = None) -> Tensor:
+        """x (B, L, D); allowed (B or 1, L, L) bool: row may look at column (None: at all)."""
         batch, length, width = x.shape
         qkv = self.qkv(self.norm_in(x)).view(batch, length, 3, self.heads, width // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)
-        seen = F.scaled_dot_product_attention(q, k, v, attn_mask=allowed[:, None])
+        mask = None if allowed is None else allowed[:, None]
+        seen = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
         x = x + self.out(seen.transpose(1, 2).reshape(batch, length, width))
         return x + self.mlp(self.norm_mid(x))
 
@@ -113,23 +114,20 @@ def residual(dimensions: int, blocks: Sequence[int], channels: int) -> tuple[nn.
 
 
 def each_trio(
-    score: Callable[[Tensor], Tensor], goals: Tensor, objects: int, at_once: int
+    score: Callable[[Tensor, Tensor], Tensor], goals: Tensor, asked: Tensor, at_once: int
 ) -> Tensor:
     """Scores (B, G, N) of a body that looks at subject, reference and query together.
 
-    `score` gives (B, T) for places (B, T, 3) of T trios, at most `at_once` of them.
+    `score` gives (T,) for the scenes (T,) and the places (T, 3) in them of T trios, at most
+    `at_once` of them; what is not `asked` (B, G, N) costs nothing and scores 0.
     """
-    batch, count = goals.shape[:2]
-    pair_BGN2 = goals[:, :, None].expand(-1, -1, objects, -1)
-    query_BGN1 = torch.arange(objects, device=goals.device).expand(batch, count, -1)[..., None]
-    trios_BT3 = torch.cat([pair_BGN2, query_BGN1], dim=-1).flatten(1, 2)
-    scores = [score(part) for part in trios_BT3.split(at_once, dim=1)]
-    return torch.cat(scores, dim=1).view(batch, count, objects)
-
-
-def pick_trios(tokens: Tensor, trios: Tensor) -> Tensor:
-    """Tokens (B, T, 3, D) of the objects at places (B, T, 3)."""
-    return pick(tokens, trios.flatten(1)).unflatten(1, trios.shape[1:])
+    none = torch.zeros(asked.shape, device=goals.device)
+    places = scene_T, goal_T, query_T = asked.nonzero(as_tuple=True)
+    if not len(scene_T):
+        return none
+    trios_T3 = torch.cat([goals[scene_T, goal_T], query_T[:, None]], dim=1)
+    parts = zip(scene_T.split(at_once), trios_T3.split(at_once), strict=True)
+    return none.index_put(places, torch.cat([score(*part) for part in parts]).float())
 
 
 def pick(x: Tensor, index: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ Shape suffixes: B scenes, N objects (padded), G goals, H and W height and width 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +31,9 @@ class Body(nn.Module, ABC):
     told = False
     """Whether it is told where the objects are instead of being shown them."""
 
+    among_all = False
+    """Whether a score depends on all objects of the scene, not on the three views alone."""
+
     @abstractmethod
     def encode(
         self, image: Tensor, views: Tensor, present: Tensor, poses: Tensor | None
@@ -38,8 +41,10 @@ class Body(nn.Module, ABC):
         """As `RelevanceModel.encode`, pictures float in 0..1."""
 
     @abstractmethod
-    def decode(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
-        """As `RelevanceModel.decode`."""
+    def decode(
+        self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
+    ) -> Tensor:
+        """As `RelevanceModel.decode`; what is not `asked` need not be scored."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,10 +57,20 @@ class BodyKind:
     """From settings and names of predicates to a network with fresh weights."""
     version: str
     """Raised when equal settings come to mean another network or another default."""
+    advantage: str = ""
+    """What it has beyond image and three views: said under every table that has it beside those
+    that see no more."""
 
 
 BODIES: Registry[BodyKind] = Registry("body")
 """Every body by name."""
+
+
+def unequal(bodies: Iterable[str]) -> list[str]:
+    """A line for each of the bodies that has more to go by than others of them."""
+    names = sorted(set(bodies) & set(BODIES))
+    told = [name for name in names if BODIES[name].advantage]
+    return [f"{name} {BODIES[name].advantage}" for name in told] if told != names else []
 
 
 class RelevanceModel(nn.Module):
@@ -110,9 +125,17 @@ class RelevanceModel(nn.Module):
             None if poses is None else poses.to(device),
         )
 
-    def decode(self, encoding: Encoding, predicate: Predicate | str, goals: Tensor) -> Tensor:
+    def decode(
+        self,
+        encoding: Encoding,
+        predicate: Predicate | str,
+        goals: Tensor,
+        asked: Tensor | None = None,
+    ) -> Tensor:
         """Scores (B, G, N), float32 logits, for goals (B, G, 2): subject and reference index.
 
+        `asked` (B, G, N) bool says which of them are wanted (None: of all objects that are
+        there); the others mean nothing, and cost nothing where nothing is shared between queries.
         Raises ModelError for a predicate that has no head here.
         """
         name = str(predicate)
@@ -120,7 +143,10 @@ class RelevanceModel(nn.Module):
             known = ", ".join(self.predicates)
             raise ModelError(f"the model has no head for {name}, was trained on {known}")
         goals = goals.to(encoding.tokens.device)
-        return self.body.decode(encoding, PREDICATES[name], goals).float()
+        if asked is None:
+            asked = encoding.present[:, None].expand(-1, goals.shape[1], -1)
+        asked = asked.to(goals.device)
+        return self.body.decode(encoding, PREDICATES[name], goals, asked).float()
 
 
 def model_config(values: Any) -> Any:

@@ -19,14 +19,14 @@ from torch.nn import functional as F
 
 from relevance.configs import config
 from relevance.models.config import Encoding, ModelConfig
-from relevance.models.layers import Extractor, each_trio, extractor, pick, residual
+from relevance.models.layers import Extractor, each_trio, extractor, residual
 from relevance.models.registry import BODIES, Body, BodyKind
 from relevance.scene import Predicate
 
 Blocks = Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1, max_length=4)]
 
-_AT_ONCE = 4096
-"""Trios of a scene that go through the dense layer at once, to bound the memory."""
+_AT_ONCE = 16384
+"""Trios that go through the dense layer at once, to bound the memory."""
 
 
 @config
@@ -96,20 +96,22 @@ class ResnetBody(Body):
         views_BNC = self.view((views - 0.5).flatten(0, 1)).unflatten(0, views.shape[:2])
         return Encoding(tokens=views_BNC, present=present, scene=self.scene(image - 0.5))
 
-    def decode(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
+    def decode(
+        self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
+    ) -> Tensor:
         """As `RelevanceModel.decode`."""
         assert encoding.scene is not None
-        scene_B1E = self.from_scene(encoding.scene)[:, None]
+        scene_BE = self.from_scene(encoding.scene)
         roles_BNE = [part(encoding.tokens) for part in self.from_role]
 
-        def score(trios_BT3: Tensor) -> Tensor:
-            parts = [pick(role, trios_BT3[..., i]) for i, role in enumerate(roles_BNE)]
-            dense_BTE = F.relu(scene_B1E + torch.stack(parts).sum(0))
-            return extractor(self.heads, predicate.name).of_trios(
-                dense_BTE.unflatten(-1, (3, self.width))
-            )
+        def score(scene_T: Tensor, trios_T3: Tensor) -> Tensor:
+            places = zip(roles_BNE, trios_T3.unbind(1), strict=True)
+            parts = [scene_BE[scene_T], *(role[scene_T, place] for role, place in places)]
+            dense_TE = F.relu(torch.stack(parts).sum(0))
+            head = extractor(self.heads, predicate.name)
+            return head.of_trios(dense_TE.unflatten(-1, (3, self.width)))
 
-        return each_trio(score, goals, encoding.tokens.shape[1], _AT_ONCE)
+        return each_trio(score, goals, asked, _AT_ONCE)
 
 
 BODIES.register("resnet", BodyKind(config=ResnetConfig, make=ResnetBody, version="1"))

@@ -18,12 +18,12 @@ from torch.nn import functional as F
 
 from relevance.configs import config
 from relevance.models.config import PATCH, Encoding, ModelConfig
-from relevance.models.layers import Extractor, each_trio, extractor, pick_trios, residual
+from relevance.models.layers import Extractor, each_trio, extractor, residual
 from relevance.models.registry import BODIES, Body, BodyKind
 from relevance.scene import Predicate
 
-_AT_ONCE = 32
-"""Trios of a scene that are convolved at once, to bound the memory."""
+_AT_ONCE = 64
+"""Trios that are convolved at once, to bound the memory."""
 
 
 @config
@@ -73,20 +73,21 @@ class Resnet3dBody(Body):
         patches = F.unfold(image - 0.5, PATCH, stride=PATCH).transpose(1, 2)
         return Encoding(tokens=(views - 0.5).flatten(2), present=present, scene=patches)
 
-    def decode(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
+    def decode(
+        self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
+    ) -> Tensor:
         """As `RelevanceModel.decode`."""
-        patches_BPX = encoding.scene
+        patches_BPX, views_BNX = encoding.scene, encoding.tokens
         assert patches_BPX is not None
 
-        def score(trios_BT3: Tensor) -> Tensor:
-            views = pick_trios(encoding.tokens, trios_BT3)
-            patches = patches_BPX[:, None].expand(-1, views.shape[1], -1, -1)
-            stack = torch.cat([patches, views], dim=2).flatten(0, 1)
+        def score(scene_T: Tensor, trios_T3: Tensor) -> Tensor:
+            stack = torch.cat([patches_BPX[scene_T], views_BNX[scene_T[:, None], trios_T3]], dim=1)
             pictures = stack.unflatten(-1, (3, PATCH, PATCH)).transpose(1, 2)
-            dense = F.relu(self.dense(self.net(pictures))).unflatten(-1, (3, self.width))
-            return extractor(self.heads, predicate.name).of_trios(dense).view(views.shape[:2])
+            dense = F.relu(self.dense(self.net(pictures)))
+            head = extractor(self.heads, predicate.name)
+            return head.of_trios(dense.unflatten(-1, (3, self.width)))
 
-        return each_trio(score, goals, encoding.tokens.shape[1], _AT_ONCE)
+        return each_trio(score, goals, asked, _AT_ONCE)
 
 
 BODIES.register("resnet3d", BodyKind(config=Resnet3dConfig, make=Resnet3dBody, version="1"))

@@ -7,7 +7,8 @@ P image patches, D width.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Literal, Self
+from dataclasses import replace
+from typing import Annotated, Literal, Self, get_args
 
 import torch
 from pydantic import Field, model_validator
@@ -15,12 +16,14 @@ from torch import Tensor, nn
 
 from relevance.configs import config
 from relevance.models.config import PATCH, Encoding, ModelConfig, divides
-from relevance.models.layers import Attention, Extractor, each_trio, extractor, pick_trios
+from relevance.models.layers import Attention, Extractor, each_trio, extractor
 from relevance.models.registry import BODIES, Body, BodyKind
 from relevance.scene import Predicate
 
-_AT_ONCE = 64
-"""Trios of a scene that go through the transformer at once, to bound the memory."""
+Reading = Literal["shared", "trio", "no-patches"]
+
+_AT_ONCE = 256
+"""Trios that go through the transformer at once, to bound the memory."""
 
 
 @config
@@ -35,7 +38,7 @@ class VitConfig(ModelConfig):
     """Attention heads; divides width."""
     layers: Annotated[int, Field(ge=1)] = 4
     """Transformer layers."""
-    attention: Literal["shared", "trio", "no-patches"] = "shared"
+    attention: Reading = "shared"
     """Who sees whom. shared: patches see patches, a view sees patches and itself, so that one
     encoding serves all goals (SORNet's mask). trio: patches and the three views of a query all
     see each other (the paper's standard transformer). no-patches: as trio, but patches do not
@@ -47,6 +50,10 @@ class VitConfig(ModelConfig):
     def _even(self) -> Self:
         divides(self.width, self.heads)
         return self
+
+    def readings(self) -> dict[str, Self]:
+        """Its three attentions."""
+        return {name: replace(self, attention=name) for name in get_args(Reading)}
 
     @classmethod
     def smoke(cls) -> Self:
@@ -89,7 +96,9 @@ class ViTBody(Body):
             views_BND = self._transform(image_BPD, views_BND)
         return Encoding(tokens=views_BND, present=present, scene=image_BPD)
 
-    def decode(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
+    def decode(
+        self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
+    ) -> Tensor:
         """As `RelevanceModel.decode`."""
         head = extractor(self.heads, predicate.name)
         tokens, scene = encoding.tokens, encoding.scene
@@ -97,27 +106,30 @@ class ViTBody(Body):
             return head(tokens, goals)
         assert scene is not None
 
-        def score(trios_BT3: Tensor) -> Tensor:
-            views = pick_trios(tokens, trios_BT3)
-            patches = scene[:, None].expand(-1, views.shape[1], -1, -1)
-            seen = self._transform(patches.flatten(0, 1), views.flatten(0, 1))
-            return head.of_trios(seen).view(views.shape[:2])
+        def score(scene_T: Tensor, trios_T3: Tensor) -> Tensor:
+            views = tokens[scene_T[:, None], trios_T3]
+            return head.of_trios(self._transform(scene[scene_T], views))
 
-        return each_trio(score, goals, tokens.shape[1], _AT_ONCE)
+        return each_trio(score, goals, asked, _AT_ONCE)
 
     def _transform(self, patches: Tensor, views: Tensor) -> Tensor:
         """Views (B, N, D) after they and the patches (B, P, D) looked at what they may see."""
         x = torch.cat([patches, views], dim=1)
-        allowed = torch.ones(x.shape[1], x.shape[1], dtype=torch.bool, device=x.device)
-        count = self.patches
-        itself = torch.eye(len(allowed), dtype=torch.bool, device=x.device)
-        if self.attention == "shared":
-            allowed[:, count:] = itself[:, count:]
-        elif self.attention == "no-patches":
-            allowed[:count, :count] = itself[:count, :count]
+        allowed = self._allowed(x.shape[1], x.device)
         for layer in self.layers:
-            x = layer(x, allowed[None])
-        return self.norm(x[:, count:])
+            x = layer(x, allowed)
+        return self.norm(x[:, self.patches :])
+
+    def _allowed(self, length: int, device: torch.device) -> Tensor | None:
+        """Who may look at whom, (1, L, L): patches first, then views; None where all may."""
+        if self.attention == "trio":
+            return None
+        allowed = torch.ones(1, length, length, dtype=torch.bool, device=device)
+        itself = torch.eye(length, dtype=torch.bool, device=device)
+        part = slice(self.patches, None) if self.attention == "shared" else slice(self.patches)
+        rows = slice(None) if self.attention == "shared" else part
+        allowed[:, rows, part] = itself[rows, part]
+        return allowed
 
 
 BODIES.register("vit", BodyKind(config=VitConfig, make=ViTBody, version="1"))

@@ -33,6 +33,7 @@ from relevance.training.examples import (
 )
 from relevance.training.losses import batch_loss, relevance_loss
 from relevance.training.settings import TRAINER_VERSION, TrainConfig
+from relevance.training.speed import Speed, measure_speed
 from relevance.training.trainer import Trainer, TrainingError, measure, train, use_bfloat16
 
 __all__ = [
@@ -41,6 +42,7 @@ __all__ = [
     "Batch",
     "CheckpointError",
     "Examples",
+    "Speed",
     "TrainConfig",
     "Trainer",
     "TrainingError",
@@ -53,6 +55,7 @@ __all__ = [
     "load_checkpoint",
     "load_examples",
     "measure",
+    "measure_speed",
     "newest_checkpoint",
     "pick_device",
     "polling",

@@ -24,7 +24,7 @@ def batch_loss(model: RelevanceModel, batch: Batch, config: TrainConfig) -> dict
         if not config.goal_objects:
             objects = torch.arange(labelled.shape[-1], device=goals.device)
             labelled = labelled & (objects != goals[..., None]).all(-2)
-        scores = model.decode(encoding, predicate, goals)
+        scores = model.decode(encoding, predicate, goals, labelled)
         terms.append(relevance_loss(scores, relevant, labelled, config.eta(predicate)))
     parts["relevance"] = torch.stack(terms).mean()
     loss = config.relevance_weight * parts["relevance"]
