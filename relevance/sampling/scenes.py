@@ -33,8 +33,8 @@ def sample_scene(
     Pure: the result depends on the arguments alone.
     """
     rng = generator(seed, f"{config.family}/{split}", index, attempt)
-    total = int(rng.integers(config.min_objects, config.max_objects + 1))
-    total += config.family == "on"
+    fewest, most = config.numbers
+    total = int(rng.integers(fewest, most + 1))
     ranges = config.randomisation
     if ranges is not None:
         config = replace(
@@ -53,8 +53,8 @@ def sample_scene(
     )
     if colors is None:
         return None
-    on_top = 0
-    if config.family == "on":
+    on_top = int(config.family == "on")
+    if config.family == "stacks":
         on_top = min(1 + int(rng.binomial(total - 1, config.stacking)), total // 2)
     standing = Standing(config)
     for i, (name, color) in enumerate(colors):
@@ -106,7 +106,7 @@ def _table_box(
     config: SceneConfig,
 ) -> Box | None:
     boxes, size = standing.boxes, _size(rng, config, config.obstacle_share, config.max_height)
-    crowding = config.crowding_on if config.family == "on" else config.crowding
+    crowding = config.crowding if config.family == "same-plane" else config.crowding_on
     crowd = bool(boxes) and rng.random() < crowding
     best, most, fitting = None, -1, 0
     for _ in range(config.tries):
@@ -190,6 +190,8 @@ def _stacked_box(
         and box.name not in taken
         and box.top + config.min_edge < config.stack_height
     ]
+    if config.family == "on" and free:  # one target, whatever its size
+        free = [free[int(rng.integers(len(free)))]]
     for _ in range(min(config.tries, 4 * len(free))):
         i = free[int(rng.integers(len(free)))]
         carrier = standing.boxes[i]
