@@ -48,7 +48,7 @@ ORDER BY family, predicate, split, policy;
 
 -- The paper's table of label distribution: per family, predicate and split, over all plans
 -- (n_actions = 'all') and by length of the plan. predicate = 'all' sums those of a family that is
--- asked several. Goals without a plan have no length, so only 'all' counts them.
+-- asked several; one that is named as a predicate has no sum. Goals without a plan have no length, so only 'all' counts them.
 CREATE OR REPLACE VIEW paper_label_distribution AS
 WITH queries AS (
     SELECT plan_id, count(*) AS queries, count(*) FILTER (relevant) AS relevant
@@ -82,9 +82,11 @@ SELECT
     family, predicate, split, n_actions, goals, solved, plans, queries, relevant,
     relevant / nullif(queries, 0) AS relevant_share
 FROM grouped
-WHERE n_actions IS NOT NULL AND (predicate <> 'all' OR family IN (
-    SELECT family FROM goals GROUP BY family HAVING count(DISTINCT predicate) > 1
-))
+WHERE n_actions IS NOT NULL AND (
+    predicate <> 'all' OR family NOT IN (SELECT predicate FROM plans) AND family IN (
+        SELECT family FROM goals GROUP BY family HAVING count(DISTINCT predicate) > 1
+    )
+)
 ORDER BY family, predicate, split, n_actions <> 'all', length(n_actions), n_actions;
 
 -- How long the plans are.

@@ -18,11 +18,10 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr, suppress
-from typing import get_args
 
 import tyro
 
-from relevance.cli.arguments import Command, Preset
+from relevance.cli.arguments import Command
 from relevance.cli.commands import COMMANDS
 from relevance.cli.terminal import UsageError, say
 from relevance.errors import RelevanceWarning

@@ -121,8 +121,10 @@ def _beside_paper(queries: Sequence[Any]) -> tuple[list[str], list[list[Any]]]:
     }
     names = ["scenes", "relevant", "irrelevant", "share"]
     rows = [
-        [q.group, q.split, q.scenes, q.relevant, q.irrelevant, q.share]
-        + list(theirs.get((q.group, q.split), (None,) * len(names)))
+        [
+            *(q.group, q.split, q.scenes, q.relevant, q.irrelevant, q.share),
+            *theirs.get((q.group, q.split), (None,) * len(names)),
+        ]
         for q in queries
         if q.scenes
     ]

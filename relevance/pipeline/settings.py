@@ -158,9 +158,9 @@ class DatasetConfig:
     def smoke(cls) -> DatasetConfig:
         """Seconds: for tests, and to see that everything runs."""
         return cls(
-            train=Counts(same_plane=12, on=12, stacks=6),
-            validation=Counts(same_plane=4, on=4, stacks=4),
-            test=Counts(same_plane=4, on=4, stacks=4),
+            train=Counts(same_plane=12, on=12),
+            validation=Counts(same_plane=4, on=4),
+            test=Counts(same_plane=4, on=4),
             scenes_per_shard=6,
             goals_per_scene=2,
         )

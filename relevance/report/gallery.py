@@ -65,7 +65,8 @@ def choose_examples(
         )
         select * from (
             select *, row_number() over (
-                partition by family, predicate order by least(n_blockers, 2) desc, md5(plan_id)) as nth
+                partition by family, predicate
+                order by least(n_blockers, 2) desc, md5(plan_id)) as nth
             from tasks)
         where nth <= ?
         """,

@@ -21,6 +21,8 @@ NEAR = 0.026
 clearance, so some boxes must leave before their neighbour can be taken."""
 CENTRED = 0.2
 """How far off a neighbour's middle a crowded box may stand, as a share of its half extent."""
+OVER = {"on": 0.15, "stacks": 0.25}
+"""How far off its carrier's middle the centre of a stacked box may be, as a share of each edge."""
 BROADSIDE = 0.15
 """How far a crowded box may be turned out of line with its neighbour's sides, rad."""
 
@@ -181,7 +183,7 @@ def _stacked_box(
     standing: Standing,
     config: SceneConfig,
 ) -> Box | None:
-    """A box on one that carries none yet, its centre over the middle half of the top face."""
+    """A box on one that carries none yet, its centre near the middle of the top face (`OVER`)."""
     taken = {box.on for box in standing.boxes}
     free = [
         i
@@ -199,7 +201,8 @@ def _stacked_box(
         size = _size(rng, config, 0.0, tallest)
         yaw = float(rng.uniform(-math.pi / 2, math.pi / 2))
         c, s = math.cos(carrier.yaw), math.sin(carrier.yaw)
-        dx, dy = rng.uniform(-0.25, 0.25, 2) * carrier.size[:2]
+        over = OVER[config.family]
+        dx, dy = rng.uniform(-over, over, 2) * carrier.size[:2]
         position = (
             round(carrier.position[0] + float(c * dx - s * dy), 4),
             round(carrier.position[1] + float(s * dx + c * dy), 4),
