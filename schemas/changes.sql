@@ -121,7 +121,7 @@ by_goal AS (
 ),
 by_query AS (
     SELECT
-        family, o.planner_version AS planner_before, n.planner_version AS planner_now,
+        f.family, o.planner_version AS planner_before, n.planner_version AS planner_now,
         o.config_hash AS config_before,
         count(*) AS queries,
         count(*) FILTER (o.relevant = n.relevant) AS equal,
@@ -134,7 +134,7 @@ by_query AS (
     GROUP BY ALL
 )
 SELECT
-    family, planner_before, planner_now, goals, newly_solved, no_longer_solved, never_solved,
+    g.family, g.planner_before, g.planner_now, goals, newly_solved, no_longer_solved, never_solved,
     same_boxes_moved, fewer_boxes_moved, more_boxes_moved, other_boxes_moved,
     coalesce(queries, 0) AS queries, coalesce(equal, 0) AS equal,
     coalesce(to_irrelevant, 0) AS to_irrelevant, coalesce(to_relevant, 0) AS to_relevant
@@ -143,4 +143,4 @@ LEFT JOIN by_query AS q
     ON (g.planner_before, g.planner_now, g.config_before)
         = (q.planner_before, q.planner_now, q.config_before)
     AND g.family IS NOT DISTINCT FROM q.family
-ORDER BY ALL;
+ORDER BY g.family, g.planner_before, g.planner_now, g.config_before;

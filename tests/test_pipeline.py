@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 from conftest import CONFIG, contents, make, small_dataset, untouched
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relevance.labels import stored_scene
@@ -84,6 +84,7 @@ def test_appending_never_renumbers(first: DatasetConfig, second: DatasetConfig) 
 
 
 @given(configs, configs)
+@settings(deadline=None)
 def test_each_predicate_may_have_scenes_of_its_own(
     first: DatasetConfig, second: DatasetConfig
 ) -> None:

@@ -125,11 +125,12 @@ def estimate(
 ) -> Estimate:
     """Make a sample of that many scenes a family, and say what the whole of `config` will cost.
 
-    Goals of the test split are replayed more often than others, so a part of the sample is of
+    Of that many a predicate, where each has its own. Goals of the test split are replayed more often than others, so a part of the sample is of
     that split. Nothing of it is kept.
     """
     split_sizes = {"train": sample - sample // 4, "validation": 0, "test": sample // 4}
-    counts = {split: Counts.each(n) for split, n in split_sizes.items()}
+    families = [f for f in FAMILIES if any(config.counts(split).of(f) for split in SPLITS)]
+    counts = {s: Counts.by_family(dict.fromkeys(families, n)) for s, n in split_sizes.items()}
     # several units of work a process, so that all processes are busy nearly to the end
     size = max(1, math.ceil(split_sizes["train"] / (2 * workers)))
     small = replace(config, scenes_per_shard=size, **counts)

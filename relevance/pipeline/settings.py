@@ -169,9 +169,9 @@ class DatasetConfig:
     def demo(cls) -> DatasetConfig:
         """Minutes: enough for a small network to learn from."""
         return cls(
-            train=Counts(same_plane=1000, on=800),
-            validation=Counts(same_plane=60, on=80),
-            test=Counts(same_plane=40, on=60),
+            train=Counts(same_plane=1000, on=1600),
+            validation=Counts(same_plane=60, on=160),
+            test=Counts(same_plane=40, on=120),
             scenes_per_shard=100,
             goals_per_scene=6,
         )
@@ -180,21 +180,21 @@ class DatasetConfig:
     def laptop(cls) -> DatasetConfig:
         """Under an hour on two cores: enough to come close to the best accuracy."""
         return cls(
-            train=Counts(same_plane=10_000, on=10_000, stacks=10_000),
-            validation=Counts(same_plane=1_000, on=1_000, stacks=1_000),
-            test=Counts(same_plane=1_000, on=1_000, stacks=1_000),
+            train=Counts(same_plane=10_000, on=16_000, stacks=8_000),
+            validation=Counts(same_plane=1_000, on=1_000, stacks=800),
+            test=Counts(same_plane=1_000, on=1_600, stacks=800),
             scenes_per_shard=250,
             goals_per_scene=6,
         )
 
     @classmethod
     def crowd(cls) -> DatasetConfig:
-        """Half an hour on two cores: up to 30 boxes, plans of up to 12 actions."""
+        """Under half an hour on two cores: up to 30 boxes, plans of up to 12 actions."""
         return cls(
-            train=Counts(same_plane=600, stacks=600),
-            validation=Counts(same_plane=60, stacks=60),
-            test=Counts(same_plane=100, stacks=100),
-            scenes_per_shard=20,
+            train=Counts(same_plane=2_200, stacks=2_200),
+            validation=Counts(same_plane=150, stacks=150),
+            test=Counts(same_plane=250, stacks=250),
+            scenes_per_shard=50,
             goals_per_scene=3,
             scene=SceneConfig(min_objects=3, max_objects=30),
             planner=PlannerConfig(max_actions=12),

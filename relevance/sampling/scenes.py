@@ -19,11 +19,11 @@ from relevance.scene.geometry import packed
 NEAR = 0.026
 """Narrowest gap of a crowded box to its neighbour, m. A finger beside a box takes 34 mm with its
 clearance, so some boxes must leave before their neighbour can be taken."""
-CENTRED = 0.2
+CENTRED = 0.1
 """How far off a neighbour's middle a crowded box may stand, as a share of its half extent."""
-OVER = {"on": 0.15, "stacks": 0.25}
+OVER = {"on": 0.2, "stacks": 0.25}
 """How far off its carrier's middle the centre of a stacked box may be, as a share of each edge."""
-BROADSIDE = 0.15
+BROADSIDE = 0.05
 """How far a crowded box may be turned out of line with its neighbour's sides, rad."""
 
 

@@ -63,7 +63,7 @@ class Examples:
     """(S, N) bool."""
     names: tuple[str, ...]
     """Ids of the scenes, S."""
-    families: tuple[str, ...]
+    families: tuple[str | None, ...]
     """What kinds of scenes they are, S."""
     goals: dict[Predicate, Goals]
 
@@ -132,7 +132,7 @@ def load_examples(
     query = """
         select scene_id, predicate, subject, reference, list(query order by query),
             list(relevant order by query), family
-        from labels join shard_families using (split, shard)
+        from labels left join shard_families using (split, shard)
         where split = ? and policy = ? and (? or not ambiguous)
             and (? or predicate in (select unnest(?::varchar[])))
             and (? or family in (select unnest(?::varchar[])))
@@ -155,7 +155,7 @@ def load_examples(
     present = np.zeros((total, objects), bool)
     found: dict[Predicate, list[tuple[int, list[int], np.ndarray, np.ndarray]]] = {}
     names: list[str] = []
-    kinds: list[str] = []
+    kinds: list[str | None] = []
     done = 0
     for sample in dataset.samples(split) if total else ():
         asked = labels.pop(sample.scene.id, None)

@@ -292,7 +292,7 @@ def measure(model: RelevanceModel, examples: Examples, batch: int = 16) -> dict[
     model.eval()
     pooled: dict[str, list[tuple[np.ndarray, ...]]] = {}
     with torch.inference_mode():
-        for predicate, family in product(examples.goals, sorted(set(examples.families))):
+        for predicate, family in product(examples.goals, sorted(set(examples.families), key=str)):
             if predicate.name not in model.predicates:
                 continue
             scenes = examples.scenes([predicate], family)
@@ -306,7 +306,7 @@ def measure(model: RelevanceModel, examples: Examples, batch: int = 16) -> dict[
                 asked = places[:, None] != goals[..., None, :]
                 arrays = (score, relevant, labelled, asked.all(-1))
                 rows = tuple(array.flatten(0, 1).cpu().numpy() for array in arrays)
-                for name in {group_of(predicate.name, family), family}:
+                for name in {group_of(predicate.name, family), family or predicate.family}:
                     pooled.setdefault(name, []).append(rows)
     return {name: _metrics(parts) for name, parts in sorted(pooled.items())}
 
