@@ -125,8 +125,8 @@ def estimate(
 ) -> Estimate:
     """Make a sample of that many scenes a family, and say what the whole of `config` will cost.
 
-    Of that many a predicate, where each has its own. Goals of the test split are replayed more often than others, so a part of the sample is of
-    that split. Nothing of it is kept.
+    Of that many a predicate, where each has its own. Goals of the test split are replayed more
+    often than others, so a part of the sample is of that split. Nothing of it is kept.
     """
     split_sizes = {"train": sample - sample // 4, "validation": 0, "test": sample // 4}
     families = [f for f in FAMILIES if any(config.counts(split).of(f) for split in SPLITS)]

@@ -11,7 +11,7 @@ stand squarely in the goal regions of others (`crowding`). An `on` scene is the 
 target that carries one other box, few more boxes, and every goal asks to stand on that target.
 In `stacks`, which is ours, many boxes carry another (`stacking`); which of the valid goals are
 asked follows stated odds (`GoalConfig`) that look at the stacks. Nothing looks at plans. With the
-defaults about SAME% (same-plane) and ON% (`on`) of the queries are relevant; in the paper 14% and
+defaults about 14% (same-plane) and 30% (`on`) of the queries are relevant; in the paper 14% and
 30%. All of it is configuration, hence in every row's hash.
 """
 

@@ -95,7 +95,7 @@ class SceneConfig:
     """Probability that a box is drawn into a goal region of an earlier one (same-plane)."""
     crowding_on: Share = 0.0
     """The same for the boxes on the table of an `on` or `stacks` scene."""
-    choices: Annotated[int, Field(ge=1)] = 16
+    choices: Annotated[int, Field(ge=1)] = 8
     """Free places of which a crowded box takes the one that closes most goal regions."""
     stacking: Share = 0.7
     """Probability that a box of a `stacks` scene stands on another (one always does; stacks are

@@ -96,7 +96,9 @@ def replanned(
         if old is not None:
             with connect(Files.open(old)) as before:
                 for table in ("plans", "labels"):
-                    connection.register(f"old_{table}", before.execute(f"FROM {table}").arrow())
+                    connection.register(
+                        f"old_{table}", before.sql(f"FROM {table}").to_arrow_table()
+                    )
                     connection.execute(f"CREATE OR REPLACE VIEW beside_{table} AS FROM old_{table}")
         found = connection.execute("FROM replanned")
         names = [column[0] for column in found.description or ()]
