@@ -9,8 +9,8 @@ from flows.head import announce, leave_table, retried, say, stage
 from flows.parameters import (
     Cluster,
     DatasetPath,
+    DatasetPreset,
     Overrides,
-    Preset,
     Workers,
     absolute,
     configured,
@@ -30,7 +30,7 @@ def generate_one(job: Job) -> ShardReport:
 @stage(process_pool())
 def generate(
     dataset: DatasetPath = "data/demo",
-    preset: Preset = "demo",
+    preset: DatasetPreset = "demo",
     overrides: Overrides | None = None,
     max_workers: Workers | None = None,
     cluster: Cluster | None = None,
@@ -40,7 +40,7 @@ def generate(
     Args:
         dataset: Folder of the dataset, or s3://bucket/prefix; made when it is not there, appended
             to when it is smaller.
-        preset: Size and settings: smoke, demo, laptop or paper.
+        preset: Size and settings: smoke, demo, laptop, crowd or paper.
         overrides: Settings that differ from the preset, e.g. {"seed": 7}; keys may be dotted.
         max_workers: Processes that work at a time; the number of cores when empty.
         cluster: Address of a Dask scheduler whose workers make the shards instead, each of which

@@ -19,6 +19,7 @@ from relevance.configs import override
 from relevance.errors import RelevanceError
 
 Preset = Literal["smoke", "demo", "laptop", "paper"]
+DatasetPreset = Literal["smoke", "demo", "laptop", "crowd", "paper"]
 Overrides = dict[str, Any]
 
 

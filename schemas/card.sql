@@ -4,29 +4,29 @@
 -- How many objects besides subject and reference the plans move.
 CREATE OR REPLACE VIEW plan_blockers AS
 SELECT
-    predicate, split, blockers,
+    family, predicate, split, blockers,
     count(*) AS plans,
-    count(*) / sum(count(*)) OVER (PARTITION BY predicate, split) AS share
+    count(*) / sum(count(*)) OVER (PARTITION BY family, predicate, split) AS share
 FROM (
     SELECT
-        predicate, split,
+        family, predicate, split,
         len(list_filter(moved, lambda name: name NOT IN (subject, reference))) AS blockers
-    FROM plans
+    FROM plans LEFT JOIN shard_families USING (split, shard)
     WHERE holds
 )
-GROUP BY predicate, split, blockers
+GROUP BY family, predicate, split, blockers
 ORDER BY ALL;
 
 -- Plans with another solution as good, or a bound left undecided: their labels could be others.
 CREATE OR REPLACE VIEW plan_ambiguity AS
 SELECT
-    predicate, split,
+    family, predicate, split,
     count(*) AS plans,
     count(*) FILTER (ambiguous) AS ambiguous,
     count(*) FILTER (ambiguous) / count(*) AS share
-FROM plans
+FROM plans LEFT JOIN shard_families USING (split, shard)
 WHERE holds
-GROUP BY predicate, split
+GROUP BY family, predicate, split
 ORDER BY ALL;
 
 -- What the number of boxes does: goals with a plan that holds, relevant queries, planning time.
@@ -65,16 +65,16 @@ ORDER BY ALL;
 -- Where planning spends its time, s: the bounds, guides, and the replays in the simulator.
 CREATE OR REPLACE VIEW bound_seconds AS
 SELECT
-    predicate,
+    family, predicate,
     count(*) AS goals,
     sum(seconds_pose) AS pose,
     sum(seconds_keyframe) AS keyframe,
     sum(seconds_path) AS path,
     sum(seconds - seconds_pose - seconds_keyframe - seconds_path - seconds_guide) AS rest,
     sum(seconds_replay) AS replay
-FROM timings
-GROUP BY predicate
-ORDER BY predicate;
+FROM timings LEFT JOIN shard_families USING (split, shard)
+GROUP BY family, predicate
+ORDER BY family, predicate;
 
 -- Draws that were rejected before a scene was kept (no room, or an object hidden).
 CREATE OR REPLACE VIEW scene_draws AS

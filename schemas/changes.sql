@@ -83,3 +83,64 @@ SELECT
 FROM labels AS n
 JOIN beside_plans AS o USING (scene_id, split, predicate, subject, reference)
 WHERE NOT o.holds;
+
+-- What planning anew changed, a row a family and an older labelling: goals of both by what became
+-- of their plans, and queries of both by what became of their labels (of the same policy). All
+-- that is moved counts, subject included.
+CREATE OR REPLACE VIEW replanned AS
+WITH goals AS (
+    SELECT
+        family, o.planner_version AS planner_before, n.planner_version AS planner_now,
+        o.config_hash AS config_before,
+        CASE
+            WHEN o.holds AND n.holds AND list_sort(o.moved) = list_sort(n.moved) THEN 'same'
+            WHEN o.holds AND n.holds AND len(n.moved) < len(o.moved) THEN 'fewer'
+            WHEN o.holds AND n.holds AND len(n.moved) > len(o.moved) THEN 'more'
+            WHEN o.holds AND n.holds THEN 'others'
+            WHEN n.holds THEN 'solved'
+            WHEN o.holds THEN 'lost'
+            ELSE 'neither'
+        END AS became
+    FROM beside_plans AS o
+    JOIN plans AS n USING (scene_id, split, predicate, subject, reference)
+    LEFT JOIN shard_families AS f ON f.split = n.split AND f.shard = n.shard
+),
+by_goal AS (
+    SELECT
+        family, planner_before, planner_now, config_before,
+        count(*) AS goals,
+        count(*) FILTER (became = 'solved') AS newly_solved,
+        count(*) FILTER (became = 'lost') AS no_longer_solved,
+        count(*) FILTER (became = 'neither') AS never_solved,
+        count(*) FILTER (became = 'same') AS same_boxes_moved,
+        count(*) FILTER (became = 'fewer') AS fewer_boxes_moved,
+        count(*) FILTER (became = 'more') AS more_boxes_moved,
+        count(*) FILTER (became = 'others') AS other_boxes_moved
+    FROM goals
+    GROUP BY ALL
+),
+by_query AS (
+    SELECT
+        f.family, o.planner_version AS planner_before, n.planner_version AS planner_now,
+        o.config_hash AS config_before,
+        count(*) AS queries,
+        count(*) FILTER (o.relevant = n.relevant) AS equal,
+        count(*) FILTER (n.relevant < o.relevant) AS to_irrelevant,
+        count(*) FILTER (n.relevant > o.relevant) AS to_relevant
+    FROM beside_labels AS o
+    JOIN labels AS n USING (scene_id, split, predicate, subject, reference, query)
+    LEFT JOIN shard_families AS f ON f.split = n.split AND f.shard = n.shard
+    WHERE o.policy = n.policy AND NOT n.is_goal_object
+    GROUP BY ALL
+)
+SELECT
+    g.family, g.planner_before, g.planner_now, goals, newly_solved, no_longer_solved, never_solved,
+    same_boxes_moved, fewer_boxes_moved, more_boxes_moved, other_boxes_moved,
+    coalesce(queries, 0) AS queries, coalesce(equal, 0) AS equal,
+    coalesce(to_irrelevant, 0) AS to_irrelevant, coalesce(to_relevant, 0) AS to_relevant
+FROM by_goal AS g
+LEFT JOIN by_query AS q
+    ON (g.planner_before, g.planner_now, g.config_before)
+        = (q.planner_before, q.planner_now, q.config_before)
+    AND g.family IS NOT DISTINCT FROM q.family
+ORDER BY g.family, g.planner_before, g.planner_now, g.config_before;

@@ -15,35 +15,40 @@ FROM (
     FROM scenes
 );
 
+-- The family of each shard's scenes: all of a shard are of one. Plans, timings and labels name
+-- their shard; a predicate may be asked of several families, whose figures are kept apart.
+CREATE OR REPLACE VIEW shard_families AS
+SELECT split, shard, min(family) AS family FROM scenes GROUP BY split, shard;
+
 -- How the labels of the queries (goal objects left out) are balanced. Two rows of each plan are
 -- of its goal objects, so that plans are counted without looking at their ids. Counting by the
 -- flags first reads no row of gathered labels (`relevance compact`).
 CREATE OR REPLACE VIEW label_balance AS
 WITH counted AS (
-    SELECT predicate, split, policy, is_goal_object, relevant, ambiguous, count(*) AS n
+    SELECT predicate, split, shard, policy, is_goal_object, relevant, ambiguous, count(*) AS n
     FROM labels
-    GROUP BY predicate, split, policy, is_goal_object, relevant, ambiguous
+    GROUP BY predicate, split, shard, policy, is_goal_object, relevant, ambiguous
 ),
 summed AS (
     SELECT
-        predicate, split, policy,
+        family, predicate, split, policy,
         coalesce(sum(n) FILTER (is_goal_object), 0)::BIGINT // 2 AS plans,
         coalesce(sum(n) FILTER (NOT is_goal_object), 0)::BIGINT AS queries,
         coalesce(sum(n) FILTER (relevant AND NOT is_goal_object), 0)::BIGINT AS relevant,
         coalesce(sum(n) FILTER (ambiguous AND NOT is_goal_object), 0)::BIGINT AS ambiguous
-    FROM counted
-    GROUP BY predicate, split, policy
+    FROM counted LEFT JOIN shard_families USING (split, shard)
+    GROUP BY family, predicate, split, policy
 )
 SELECT
-    predicate, split, policy, plans, queries, relevant,
+    family, predicate, split, policy, plans, queries, relevant,
     relevant / nullif(queries, 0) AS relevant_share,
     ambiguous / nullif(queries, 0) AS ambiguous_share
 FROM summed
-ORDER BY predicate, split, policy;
+ORDER BY family, predicate, split, policy;
 
--- The paper's table of label distribution: per predicate and split, over all plans
--- (n_actions = 'all') and by length of the plan. predicate = 'same-plane' sums those of that
--- family; one that is named as a predicate has no sum. Goals without a plan have no length, so only 'all' counts them.
+-- The paper's table of label distribution: per family, predicate and split, over all plans
+-- (n_actions = 'all') and by length of the plan. predicate = 'all' sums those of a family that is
+-- asked several; one that is named as a predicate has no sum. Goals without a plan have no length, so only 'all' counts them.
 CREATE OR REPLACE VIEW paper_label_distribution AS
 WITH queries AS (
     SELECT plan_id, count(*) AS queries, count(*) FILTER (relevant) AS relevant
@@ -63,8 +68,7 @@ goals AS (
 ),
 grouped AS (
     SELECT
-        CASE WHEN grouping(predicate) = 1 THEN family ELSE predicate END AS predicate,
-        grouping(predicate) AS is_family, family, split,
+        family, CASE WHEN grouping(predicate) = 1 THEN 'all' ELSE predicate END AS predicate, split,
         CASE WHEN grouping(n_actions) = 1 THEN 'all' ELSE n_actions::VARCHAR END AS n_actions,
         count(*) AS goals, count(*) FILTER (solved) AS solved, count(*) FILTER (holds) AS plans,
         sum(queries)::BIGINT AS queries, sum(relevant)::BIGINT AS relevant
@@ -75,28 +79,32 @@ grouped AS (
     )
 )
 SELECT
-    predicate, split, n_actions, goals, solved, plans, queries, relevant,
+    family, predicate, split, n_actions, goals, solved, plans, queries, relevant,
     relevant / nullif(queries, 0) AS relevant_share
 FROM grouped
-WHERE n_actions IS NOT NULL AND (is_family = 0 OR family NOT IN (SELECT predicate FROM plans))
-ORDER BY predicate, split, n_actions <> 'all', length(n_actions), n_actions;
+WHERE n_actions IS NOT NULL AND (
+    predicate <> 'all' OR family NOT IN (SELECT predicate FROM plans) AND family IN (
+        SELECT family FROM goals GROUP BY family HAVING count(DISTINCT predicate) > 1
+    )
+)
+ORDER BY family, predicate, split, n_actions <> 'all', length(n_actions), n_actions;
 
 -- How long the plans are.
 CREATE OR REPLACE VIEW plan_lengths AS
 SELECT
-    predicate, split, n_actions,
+    family, predicate, split, n_actions,
     count(*) AS plans,
-    count(*) / sum(count(*)) OVER (PARTITION BY predicate, split) AS share
-FROM plans
+    count(*) / sum(count(*)) OVER (PARTITION BY family, predicate, split) AS share
+FROM plans LEFT JOIN shard_families USING (split, shard)
 WHERE holds
-GROUP BY predicate, split, n_actions
+GROUP BY family, predicate, split, n_actions
 ORDER BY ALL;
 
 -- Goals that made no labels, by reason; a plan that a check refuted or that the replay refused
 -- stands here too.
 CREATE OR REPLACE VIEW plan_failures AS
 SELECT
-    predicate, split,
+    family, predicate, split,
     CASE
         WHEN status <> 'solved' THEN status
         WHEN NOT check_ok THEN 'refuted by the dense check'
@@ -108,15 +116,15 @@ SELECT
         ELSE replay_reason
     END AS reason,
     count(*) AS goals
-FROM plans
+FROM plans LEFT JOIN shard_families USING (split, shard)
 WHERE NOT holds
 GROUP BY ALL
-ORDER BY predicate, split, goals DESC, status, reason;
+ORDER BY family, predicate, split, goals DESC, status, reason;
 
 -- Does every plan hold, and how many were replayed in the simulator?
 CREATE OR REPLACE VIEW plan_verdicts AS
 SELECT
-    predicate, split,
+    family, predicate, split,
     count(*) AS goals,
     count(*) FILTER (status = 'solved') AS solved,
     count(*) FILTER (holds) AS plans,
@@ -125,21 +133,21 @@ SELECT
     count(*) FILTER (replay_ok) AS replay_ok,
     max(max_penetration) FILTER (holds) AS max_penetration,
     max(replay_max_penetration) FILTER (holds) AS replay_max_penetration
-FROM plans
+FROM plans LEFT JOIN shard_families USING (split, shard)
 GROUP BY ALL
 ORDER BY ALL;
 
 -- Planning time in seconds, failures included.
 CREATE OR REPLACE VIEW plan_seconds AS
 SELECT
-    predicate, split,
+    family, predicate, split,
     count(*) AS goals,
     sum(seconds) AS total,
     avg(seconds) AS mean,
     median(seconds) AS median,
     quantile_cont(seconds, 0.9) AS p90,
     max(seconds) AS longest
-FROM timings
+FROM timings LEFT JOIN shard_families USING (split, shard)
 GROUP BY ALL
 ORDER BY ALL;
 
@@ -175,10 +183,10 @@ ORDER BY scene_id;
 -- Where the hours went: busy time of one process, s. Stages are scenes and the predicates.
 CREATE OR REPLACE VIEW stage_seconds AS
 SELECT
-    stage, split,
+    family, stage, split,
     count(*) AS shards, sum(rows)::BIGINT AS rows,
     sum(seconds) AS seconds, sum(seconds_cpu) AS seconds_cpu,
     sum(rows) / nullif(sum(seconds), 0) AS rows_per_second
-FROM durations
-GROUP BY stage, split
-ORDER BY stage, split;
+FROM durations LEFT JOIN shard_families USING (split, shard)
+GROUP BY family, stage, split
+ORDER BY family, stage, split;

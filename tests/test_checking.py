@@ -364,7 +364,7 @@ def test_label_distribution_is_a_recount() -> None:
     goals, solved, queries, relevant = Counter(), Counter(), Counter(), Counter()
 
     def groups(plan: dict) -> list[tuple[str, str, str]]:
-        names = [plan["predicate"]] + ["same-plane"] * (plan["predicate"] != "on")
+        names = [plan["predicate"]] + ["all"] * (plan["predicate"] != "on")
         lengths = ["all"] + [str(plan["n_actions"])] * (plan["status"] == "solved")
         return [(name, plan["split"], length) for name in names for length in lengths]
 
@@ -420,7 +420,7 @@ def test_statistics_are_what_a_recount_gives() -> None:
         for plan in plans
         if plan["holds"]
     )
-    assert {tuple(row[:3]): row[3] for row in blockers.rows} == moved
+    assert {tuple(row[1:4]): row[4] for row in blockers.rows} == moved
     ambiguity = counted["plan_ambiguity"]
     assert sum(row[ambiguity.columns.index("ambiguous")] for row in ambiguity.rows) == sum(
         plan["ambiguous"] and plan["holds"] for plan in plans

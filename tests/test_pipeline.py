@@ -9,13 +9,14 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from conftest import CONFIG, contents, make, small_dataset, untouched
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relevance import simulation
@@ -24,6 +25,7 @@ from relevance.pipeline import (
     Counts,
     DatasetConfig,
     ShardSpec,
+    append,
     generate_shard,
     label_shard,
     labelling,
@@ -32,8 +34,10 @@ from relevance.pipeline import (
     scenes,
     shard_specs,
 )
+from relevance.pipeline.settings import scenes_of
+from relevance.report.paper import paper
 from relevance.sampling import SceneConfig, sample_goals, sample_scene
-from relevance.scene import FAMILIES, PREDICATES
+from relevance.scene import FAMILIES, PREDICATES, asked_of
 from relevance.store import SPLITS, Dataset, DatasetError
 
 
@@ -44,7 +48,8 @@ def made(tmp_path: Path) -> Path:
 
 # which shards ----------------------------------------------------------------------------------
 
-counts = st.builds(Counts, same_plane=st.integers(0, 9), on=st.integers(0, 9))
+few = st.integers(0, 9)
+counts = st.builds(Counts, same_plane=few, on=few, stacks=few)
 configs = st.builds(
     DatasetConfig, train=counts, validation=counts, test=counts, scenes_per_shard=st.integers(1, 5)
 )
@@ -79,17 +84,76 @@ def test_appending_never_renumbers(first: DatasetConfig, second: DatasetConfig) 
             assert have == max(asked)
 
 
+@given(configs, configs)
+@settings(deadline=None)
+def test_each_predicate_may_have_scenes_of_its_own(
+    first: DatasetConfig, second: DatasetConfig
+) -> None:
+    """The paper's way; a predicate that is asked of two families has them in both."""
+    first, second = (replace(config, own_scenes=True) for config in (first, second))
+    specs = shard_specs(second, shard_specs(first))
+    for split in SPLITS:
+        mine = [spec for spec in specs if spec.split == split]
+        assert all(len(spec.predicates) == 1 for spec in mine)
+        wanted = {f: max(c.counts(split).of(f) for c in (first, second)) for f in FAMILIES}
+        for family in FAMILIES:
+            for predicate in asked_of(family):
+                own = [s for s in mine if s.family == family and predicate in s.predicates]
+                assert sum(spec.count for spec in own) == wanted[family]
+        assert scenes_of(specs, split, each=True) == Counts.by_family(wanted)
+        total = {family: n * len(asked_of(family)) for family, n in wanted.items()}
+        assert scenes_of(specs, split) == Counts.by_family(total)
+
+
+def test_whose_scenes_they_are_is_a_setting_of_the_scenes(tmp_path: Path) -> None:
+    prepare(tmp_path, CONFIG)
+    own = replace(CONFIG, own_scenes=True)
+    assert own.scenes_hash != CONFIG.scenes_hash
+    with pytest.raises(DatasetError, match=r"config\.own_scenes: the dataset was made with False"):
+        prepare(tmp_path, own)
+    specs = prepare(tmp_path / "own", own)
+    assert prepare(tmp_path / "own", own) == specs
+    assert load_config(Dataset.open(tmp_path / "own")) == own
+    append(tmp_path / "own", "train", same_plane=1)
+    assert load_config(Dataset.open(tmp_path / "own")).train.same_plane == 4
+
+
 def test_a_shard_knows_its_predicates() -> None:
     spec = ShardSpec(split="train", shard=0, family="on", first=0, count=1)
     assert spec.predicates == (PREDICATES["on"],)
-    assert len(replace(spec, family="same-plane").predicates) == 4
+    assert replace(spec, family="stacks").predicates == (PREDICATES["on"],)
+    plane = replace(spec, family="same-plane")
+    assert len(plane.predicates) == 4
+    assert replace(plane, predicate="behind").predicates == (PREDICATES["behind"],)
 
 
-@pytest.mark.parametrize("preset", ["smoke", "demo", "laptop", "paper"])
-def test_presets(preset: str) -> None:
+@pytest.mark.parametrize(
+    ("preset", "families"),
+    [
+        ("smoke", {"same-plane", "on"}),
+        ("demo", {"same-plane", "on"}),
+        ("laptop", {"same-plane", "on", "stacks"}),
+        ("crowd", {"same-plane", "stacks"}),
+        ("paper", {"same-plane", "on"}),
+    ],
+)
+def test_presets(preset: str, families: set[str]) -> None:
     config = getattr(DatasetConfig, preset)()
     for split in SPLITS:
-        assert min(config.counts(split).same_plane, config.counts(split).on) > 0
+        assert {f for f in FAMILIES if config.counts(split).of(f)} == families
+
+
+def test_the_paper_s_preset_has_the_paper_s_scenes() -> None:
+    config = DatasetConfig.paper()
+    for split, theirs in (("train", paper().scenes), ("test", paper().test_scenes)):
+        mine = Counter()
+        for spec in shard_specs(config):
+            if spec.split == split:
+                (predicate,) = spec.predicates
+                mine[predicate.name] += spec.count
+        assert mine == theirs
+    assert sum(paper().scenes.values()) == 480_000
+    assert config.goals_per_scene == 25
 
 
 @pytest.mark.parametrize(
@@ -122,7 +186,7 @@ def test_prepare_twice_and_more(tmp_path: Path) -> None:
     assert sum(spec.count for spec in grown) == sum(spec.count for spec in specs) + 4
     assert prepare(tmp_path, CONFIG) == grown, "asking for fewer keeps what is there"
     stored = Dataset.open(tmp_path).description
-    assert stored["counts"]["train"] == {"same-plane": 7, "on": 2}
+    assert stored["counts"]["train"] == {"same-plane": 7, "on": 2, "stacks": 0}
     assert load_config(Dataset.open(tmp_path)) == more
 
 

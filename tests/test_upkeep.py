@@ -458,6 +458,11 @@ def test_an_estimate_is_close_and_kept(made: Path, tmp_path: Path) -> None:
     per_scene = found.quantities.gigabytes / 80, real.gigabytes / 8
     assert 0.4 < per_scene[0] / per_scene[1] < 1.6
     assert 0.4 < found.quantities.goals / (10 * real.goals) < 1.6
+    asked = sum(q.relevant + q.irrelevant for q in found.queries)
+    expected = found.quantities.labels - 2 * found.quantities.plans
+    assert asked == pytest.approx(expected, rel=0.5)  # rates by split there, of all splits here
+    assert {(q.group, q.split): q.scenes for q in found.queries}["on", "train"] == 40
+    assert "stacks" not in {q.group for q in found.queries}
     assert found.quantities.hours_labels > 0
     assert found.quantities.hours_scenes > 0
     found.write(tmp_path / "new")

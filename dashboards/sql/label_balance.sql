@@ -1,5 +1,5 @@
--- Label distribution of one split: a row a predicate, a family sums its own.
-SELECT predicate, goals, solved, plans, queries, relevant, relevant_share
+-- Label distribution of one split: a row a family and predicate, and one that sums a family.
+SELECT family, predicate, goals, solved, plans, queries, relevant, relevant_share
 FROM paper_label_distribution
 WHERE split = $split AND n_actions = 'all'
-ORDER BY predicate IN (SELECT predicate FROM plans), predicate;
+ORDER BY family, predicate <> 'all', predicate;

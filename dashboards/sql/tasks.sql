@@ -20,6 +20,8 @@ SELECT
     len(list_filter(p.moved, lambda name: name NOT IN (p.subject, p.reference))) AS blockers
 FROM plans AS p LEFT JOIN scored AS s USING (scene_id, predicate, subject, reference)
 LEFT JOIN labelled AS l USING (plan_id)
+LEFT JOIN shard_families AS f ON f.split = p.split AND f.shard = p.shard
 WHERE p.split = $split AND p.predicate IN (SELECT unnest($predicates::VARCHAR[]))
+    AND f.family IN (SELECT unnest($families::VARCHAR[]))
     AND p.status IN (SELECT unnest($statuses::VARCHAR[]))
 ORDER BY md5(p.plan_id);

@@ -4,8 +4,7 @@ import streamlit as st
 
 from dashboards.data import chosen, figures, percent_column, predictions
 from relevance.report.paper import paper
-from relevance.report.style import DASH, GROUPS, percent
-from relevance.scene import PREDICATES
+from relevance.report.style import DASH, GROUPS, groups, percent
 
 choice = chosen()
 if choice.checkpoint is None:
@@ -20,8 +19,7 @@ if not len(found):
         "`relevance evaluate` makes them."
     )
     st.stop()
-groups = dict.fromkeys((*GROUPS, *PREDICATES))
-by_group = {g: found.of(g).accuracy(choice.beta) for g in groups if len(found.of(g))}
+by_group = {g: found.of(g).accuracy(choice.beta) for g in groups() if len(found.of(g))}
 shown = []
 for group in (g for g in GROUPS if g in by_group):
     a, theirs = by_group[group], paper().accuracy.get(group)

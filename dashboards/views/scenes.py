@@ -7,7 +7,7 @@ import streamlit as st
 
 from dashboards.data import ask, chosen, samples
 from relevance.report.gallery import outlined
-from relevance.scene import PREDICATES
+from relevance.scene import FAMILIES, PREDICATES
 from relevance.store import Sample
 
 PER_PAGE = 9
@@ -35,7 +35,8 @@ def show(sample: Sample, task: Mapping[str, Any], beta: float) -> None:
 
 
 choice = chosen()
-one, two, three = st.columns([3, 2, 1])
+zero, one, two, three = st.columns([2, 3, 2, 1])
+families = zero.multiselect("Families", list(FAMILIES), list(FAMILIES), key="families")
 predicates = one.multiselect("Predicates", list(PREDICATES), list(PREDICATES), key="predicates")
 known = [row["status"] for row in ask(choice, "statuses")]
 statuses = two.multiselect("Status", known, [s for s in known if s == "solved"], key="statuses")
@@ -44,6 +45,7 @@ tasks = ask(
     choice,
     "tasks",
     split=choice.split,
+    families=families,
     predicates=predicates,
     statuses=statuses,
     checkpoint_id=choice.checkpoint or "",

@@ -126,9 +126,10 @@ def _predicates(scenes: Scenes) -> tuple[Predicate, ...]:
 def _task(
     index: int, predicate: Predicate, boxes: int, seed: int, max_edge: float, stream: str
 ) -> Task:
-    # The `on` family has one box more than its config says.
+    # Of any number of boxes are those with stacks, which have one more than their config says.
     count = boxes - (predicate.stacked)
-    start = SceneConfig(family=predicate.family, min_objects=2, max_edge=max_edge)
+    family = "stacks" if predicate.stacked else predicate.family
+    start = SceneConfig(family=family, min_objects=2, max_edge=max_edge)
     config = replace(start, min_objects=count, max_objects=count)
     for attempt in range(ATTEMPTS):
         scene = sample_scene(config, seed=seed, index=index, split=stream, attempt=attempt)

@@ -5,13 +5,15 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import tyro
 
 from relevance.cli.terminal import UsageError
 
 Preset = Literal["smoke", "demo", "laptop", "paper"]
+DatasetPreset = Literal["smoke", "demo", "laptop", "crowd", "paper"]
+"""Sizes of datasets alone; the others are sizes of everything."""
 DatasetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATASET")]
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
 OptionalName = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
@@ -29,7 +31,8 @@ class Command:
     make: Callable[..., Callable[..., int]]
     about: str
     examples: tuple[str, ...]
-    preset: Preset = "demo"
+    preset: str = "demo"
+    presets: tuple[str, ...] = get_args(Preset)
     decides: tuple[str, ...] = ()
     """Flags whose values `make` takes after the preset: other flags depend on them."""
 

@@ -58,6 +58,27 @@ def _sql(_: Preset) -> Callable[..., int]:
     return sql
 
 
+def _diff(_: Preset) -> Callable[..., int]:
+    def diff(dataset: DatasetArg, old: OptionalPath = None, format: Format = "table") -> int:
+        """Count what planning anew changed: goals by their plans, queries by their labels.
+
+        Args:
+            dataset: Folder of the dataset, with its labels of today.
+            old: Folder of the same scenes, labelled before; else what the dataset keeps beside.
+            format: How to print the rows.
+        """
+        from relevance.store import replanned
+
+        columns, rows = replanned(dataset, old)
+        if format == "table":  # few rows of many figures
+            wide = [[name, *values] for name, *values in zip(columns, *rows, strict=True)]
+            columns, rows = [wide[0][0], *map(str, wide[0][1:])], wide[1:]
+        show(columns, rows, format, title=f"{dataset}: planned anew")
+        return 0
+
+    return diff
+
+
 def _stats(_: Preset) -> Callable[..., int]:
     def stats(
         dataset: DatasetArg,
@@ -119,6 +140,14 @@ COMMANDS = {
             'relevance sql data/tables "select relevant, count(*) from labels group by 1"',
             'relevance sql data/tables "from plans" --format csv > plans.csv',
             'relevance sql data/tables "select why, count(*) from label_changes group by all"',
+        ),
+    ),
+    "diff": Command(
+        make=_diff,
+        about="what planning a dataset anew changed",
+        examples=(
+            "relevance diff data/tables",
+            "relevance diff data/tables --old data/tables-before",
         ),
     ),
     "stats": Command(

@@ -4,7 +4,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
@@ -12,6 +12,7 @@ from relevance.cli.arguments import (
     CORES,
     Command,
     DatasetArg,
+    DatasetPreset,
     OptionalCount,
     OptionalName,
     Preset,
@@ -24,7 +25,7 @@ from relevance.cli.terminal import Format, bar, say, show
 from relevance.workers import gather
 
 
-def _estimate(preset: Preset) -> Callable[..., int]:
+def _estimate(preset: DatasetPreset) -> Callable[..., int]:
     from relevance.pipeline import DatasetConfig, Quantities, actual, estimate, load_config
     from relevance.pipeline.estimating import Estimate, Job
     from relevance.store import Dataset, locate
@@ -45,7 +46,7 @@ def _estimate(preset: Preset) -> Callable[..., int]:
 
     def estimating(
         dataset: DatasetArg,
-        preset: Preset = preset,
+        preset: DatasetPreset = preset,
         sample: int = 32,
         workers: Workers = CORES,
         format: Format = "table",
@@ -93,6 +94,9 @@ def _estimate(preset: Preset) -> Callable[..., int]:
                 for row, (_, value) in zip(rows, real, strict=True)
             ]
         show(columns, rows, format, title=f"{dataset}, {found.workers} processes")
+        if found.queries and format == "table":
+            names, asked = _beside_paper(found.queries)
+            show(names, asked, format, title="Queries, beside the paper's")
         say(
             f"from {found.sample_scenes} scenes and {found.sample_goals} goals; "
             f"planning time give or take {found.uncertainty:.0%}"
@@ -102,20 +106,45 @@ def _estimate(preset: Preset) -> Callable[..., int]:
     return estimating
 
 
+def _beside_paper(queries: Sequence[Any]) -> tuple[list[str], list[list[Any]]]:
+    """Columns and rows of the queries that are foreseen, the paper's of that split beside them."""
+    from relevance.report.paper import paper
+
+    theirs = {
+        (name, split): (scenes[name], found.relevant, found.irrelevant, found.share)
+        for split, scenes, counts in (
+            ("train", paper().scenes, paper().train),
+            ("test", paper().test_scenes, paper().test),
+        )
+        for name, found in counts.items()
+        if name in scenes
+    }
+    names = ["scenes", "relevant", "irrelevant", "share"]
+    rows = [
+        [
+            *(q.group, q.split, q.scenes, q.relevant, q.irrelevant, q.share),
+            *theirs.get((q.group, q.split), (None,) * len(names)),
+        ]
+        for q in queries
+        if q.scenes
+    ]
+    return ["queries of", "split", *names, *(f"paper's {name}" for name in names)], rows
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Unit:
     run: Callable[..., Any]
     size: int
 
 
-def _generate(preset: Preset) -> Callable[..., int]:
+def _generate(preset: DatasetPreset) -> Callable[..., int]:
     from relevance.pipeline import DatasetConfig, scenes_work
 
     start: DatasetConfig = getattr(DatasetConfig, preset)()
 
     def generate(
         dataset: DatasetArg,
-        preset: Preset = preset,
+        preset: DatasetPreset = preset,
         workers: Workers = CORES,
         config: Annotated[DatasetConfig, tyro.conf.arg(name="")] = start,
     ) -> int:
@@ -188,6 +217,7 @@ def _append(_: Preset) -> Callable[..., int]:
         split: Literal["train", "validation", "test"] = "train",
         same_plane: int = 0,
         on: int = 0,
+        stacks: int = 0,
     ) -> int:
         """Add scenes to a dataset, as further shards; nothing that is there is touched.
 
@@ -198,11 +228,12 @@ def _append(_: Preset) -> Callable[..., int]:
             dataset: Folder of the dataset.
             split: Which split grows.
             same_plane: How many scenes for the same-plane predicates.
-            on: How many scenes for `on`.
+            on: How many scenes for `on`, one box on another.
+            stacks: How many scenes with stacks everywhere.
         """
         from relevance.pipeline import append
 
-        specs = append(dataset, split, same_plane=same_plane, on=on)
+        specs = append(dataset, split, same_plane=same_plane, on=on, stacks=stacks)
         say(f"{dataset}: {len(specs)} shards now")
         return 0
 
@@ -245,11 +276,13 @@ def _repair(_: Preset) -> Callable[..., int]:
 COMMANDS = {
     "estimate": Command(
         make=_estimate,
+        presets=get_args(DatasetPreset),
         about="rows, gigabytes and hours before a dataset is made, and how far off after",
         examples=("relevance estimate data/tables --preset laptop",),
     ),
     "generate": Command(
         make=_generate,
+        presets=get_args(DatasetPreset),
         about="random scenes, rendered",
         examples=(
             "relevance generate data/tables --preset laptop --seed 7",

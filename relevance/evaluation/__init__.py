@@ -9,6 +9,7 @@ from relevance.evaluation.comparisons import (
     left_out,
     read_evaluations,
     settings,
+    shown_as,
     speed_table,
     summarise,
 )
@@ -56,6 +57,7 @@ __all__ = [
     "read_evaluations",
     "read_predictions",
     "settings",
+    "shown_as",
     "speed_table",
     "summarise",
     "unjudged",

@@ -8,14 +8,14 @@ paper's way, misses left out, stands beside it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from relevance.evaluation.predictions import in_group
 from relevance.metrics import Interval, mean, mean_interval, ratio_interval
 from relevance.planner import PLANNER_VERSION
-from relevance.scene import FAMILIES
+from relevance.scene import FAMILIES, group_of
 from relevance.store import Dataset
 
 
@@ -96,7 +96,10 @@ def _all_rows(dataset: Dataset, checkpoint_id: str) -> list[dict[str, Any]]:
     with dataset.connect() as connection:
         found = connection.execute(
             """
-            select * from evaluations where checkpoint_id = ?
+            select e.*, family from evaluations e
+            left join (select scene_id, any_value(family) as family from scenes group by scene_id)
+                using (scene_id)
+            where checkpoint_id = ?
             order by guide, search, beta, predicate, scene_id, subject, reference
             """,
             [checkpoint_id],
@@ -118,8 +121,8 @@ def _kind(rows: Sequence[dict[str, Any]]) -> tuple[str | None, str | None] | Non
 
 
 def summarise(rows: Sequence[dict[str, Any]], group: str = "all") -> Comparison:
-    """Sum up rows of one guide, search and beta; `group` is a predicate, `same-plane` or `all`."""
-    chosen = [row for row in rows if in_group(row["predicate"], group)]
+    """Sum up rows of one guide, search and beta; `group` is a predicate, a family or `all`."""
+    chosen = [row for row in rows if in_group(shown_as(row), group)]
     setting = {(row["guide"], row["search"], row["beta"]) for row in rows}
     assert len(setting) == 1, f"rows of one guide, search and beta, got {setting}"
     guide, search, beta = setting.pop()
@@ -159,6 +162,11 @@ def summarise(rows: Sequence[dict[str, Any]], group: str = "all") -> Comparison:
         actions_guided=mean(column("n_actions_guided", both)),
         kept=mean([row["n_kept"] / row["n_objects"] for row in chosen if row["n_kept"]]),
     )
+
+
+def shown_as(row: Mapping[str, Any]) -> str:
+    """The name that figures give the predicate of a row, see `scene.group_of`."""
+    return group_of(row["predicate"], row.get("family"))
 
 
 def guided_cost(row: dict[str, Any]) -> float:

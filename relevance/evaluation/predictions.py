@@ -16,7 +16,7 @@ import numpy as np
 
 from relevance.evaluation.scorer import EvaluationError, enter, open_checkpoint, policy_of
 from relevance.metrics import Accuracy
-from relevance.scene import PREDICATES, Goal
+from relevance.scene import PREDICATES, Goal, group_of
 from relevance.store import Dataset, Labelling
 
 Progress = Callable[[int, int], None]
@@ -110,6 +110,7 @@ class Predictions:
     """Predictions of one checkpoint as columns, (R,) each."""
 
     predicate: np.ndarray
+    """As figures name it: the family where that is not the predicate's own (`group_of`)."""
     task: np.ndarray
     """Number of the task that the row belongs to."""
     relevant: np.ndarray
@@ -145,7 +146,7 @@ class Predictions:
 
 
 def in_group(predicate: str, group: str) -> bool:
-    """Whether a predicate belongs to `all`, to a family or is the group itself."""
+    """Whether a predicate, as figures name it, is in `all`, in a family or the group itself."""
     if group in ("all", predicate):
         return True
     return predicate in PREDICATES and PREDICATES[predicate].family == group
@@ -161,17 +162,19 @@ def read_predictions(dataset: Dataset, checkpoint_id: str, *, split: str = "test
     with dataset.connect(policy=policy) as connection:
         columns = connection.execute(
             """
-            select predicate, l.relevant, score, l.is_goal_object,
+            select predicate, family, l.relevant, score, l.is_goal_object,
                 dense_rank() over (order by scene_id, predicate, subject, reference) as task
             from predictions
             join labels l using (split, scene_id, predicate, subject, reference, query)
+            left join shard_families using (split, shard)
             where checkpoint_id = ? and split = ? and l.policy = ?
             order by task, query
             """,
             [checkpoint_id, split, policy],
         ).fetchnumpy()
+    pairs = zip(columns["predicate"], columns["family"], strict=True)
     return Predictions(
-        predicate=np.asarray(columns["predicate"], dtype=str),
+        predicate=np.array([group_of(predicate, family) for predicate, family in pairs], str),
         task=np.asarray(columns["task"], dtype=int),
         relevant=np.asarray(columns["relevant"], dtype=bool),
         score=np.asarray(columns["score"], dtype=float),

@@ -108,7 +108,7 @@ class Task:
     shard: int
     goal: Goal
     nth: int
-    """Its place among the predicate's tasks, from 1."""
+    """Its place among the tasks of its predicate and family, from 1."""
 
 
 def choose_tasks(dataset: Dataset, *, split: str, per_predicate: int) -> list[Task]:
@@ -120,10 +120,11 @@ def choose_tasks(dataset: Dataset, *, split: str, per_predicate: int) -> list[Ta
         rows = connection.execute(
             """
             select plan_id, scene_id, shard, predicate, subject, reference, nth from (
-                select *, row_number() over (partition by predicate order by md5(plan_id)) as nth
-                from plans where split = ?)
+                select *, row_number() over (
+                    partition by family, predicate order by md5(plan_id)) as nth
+                from plans left join shard_families using (split, shard) where split = ?)
             where ? = 0 or nth <= ?
-            order by predicate, nth
+            order by predicate, family, nth
             """,
             [split, per_predicate, per_predicate],
         ).fetchall()

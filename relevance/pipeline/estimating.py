@@ -24,7 +24,7 @@ from relevance.pipeline.settings import (
     ShardSpec,
     shard_specs,
 )
-from relevance.scene import FAMILIES
+from relevance.scene import FAMILIES, group_of
 from relevance.store import SPLITS, Dataset, empty_size, locate, replacing, sql
 
 FILE = "estimate.json"
@@ -61,10 +61,31 @@ class Quantities:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Queries:
+    """How many queries of a predicate a split will have, goal objects left out."""
+
+    group: str
+    """The predicate, or the family that borrows it (`scene.group_of`)."""
+    split: str
+    scenes: int
+    relevant: int
+    irrelevant: int
+    sample: int
+    """Queries that it rests on."""
+
+    @property
+    def share(self) -> float:
+        """Relevant among all."""
+        return self.relevant / max(self.relevant + self.irrelevant, 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
     """What was foreseen for a config, and from how much."""
 
     quantities: Quantities
+    queries: tuple[Queries, ...] = ()
+    """By predicate, family and split."""
     workers: int
     """Processes at a time, in the sample and later."""
     sample_scenes: int
@@ -91,7 +112,8 @@ class Estimate:
         if not file.is_file():
             return None
         raw = json.loads(file.read_text())
-        return cls(**{**raw, "quantities": Quantities(**raw["quantities"])})
+        queries = tuple(Queries(**row) for row in raw.get("queries", ()))
+        return cls(**{**raw, "quantities": Quantities(**raw["quantities"]), "queries": queries})
 
 
 def _one_by_one(jobs: Sequence[Job]) -> list[ShardReport]:
@@ -103,11 +125,12 @@ def estimate(
 ) -> Estimate:
     """Make a sample of that many scenes a family, and say what the whole of `config` will cost.
 
-    Goals of the test split are replayed more often than others, so a part of the sample is of
-    that split. Nothing of it is kept.
+    Of that many a predicate, where each has its own. Goals of the test split are replayed more
+    often than others, so a part of the sample is of that split. Nothing of it is kept.
     """
     split_sizes = {"train": sample - sample // 4, "validation": 0, "test": sample // 4}
-    counts = {split: Counts.each(n) for split, n in split_sizes.items()}
+    families = [f for f in FAMILIES if any(config.counts(split).of(f) for split in SPLITS)]
+    counts = {s: Counts.by_family(dict.fromkeys(families, n)) for s, n in split_sizes.items()}
     # several units of work a process, so that all processes are busy nearly to the end
     size = max(1, math.ceil(split_sizes["train"] / (2 * workers)))
     small = replace(config, scenes_per_shard=size, **counts)
@@ -121,12 +144,13 @@ def estimate(
             for family in FAMILIES
             for split in ("train", "test")
         }
+        planned = shard_specs(config)
+        queries = _queries(folder, specs, planned)
         _, [[mean, deviation, scenes]] = sql(
             folder,
             "select avg(s), stddev_samp(s), count(*) from (select scene_id, sum(seconds) as s"
             " from timings join plans using (plan_id) group by scene_id)",
         )
-    planned = shard_specs(config)
     total = _Rates()
     for family in FAMILIES:
         for split in SPLITS:
@@ -143,12 +167,50 @@ def estimate(
             hours_scenes=total.seconds_scenes / 3600,
             hours_labels=total.seconds_labels / 3600,
         ),
+        queries=queries,
         workers=workers,
         sample_scenes=int(scenes),
         sample_goals=round(sum(rate.goals for rate in rates.values())),
         uncertainty=2 * deviation / math.sqrt(scenes) / mean if scenes > 1 and mean else 1.0,
         config_hash=config.content_hash,
     )
+
+
+def _queries(
+    root: str | Path, sample: Sequence[ShardSpec], planned: Sequence[ShardSpec]
+) -> tuple[Queries, ...]:
+    """What the labels of a sample come to in the splits of the whole."""
+    _, rows = sql(
+        root,
+        "select split, shard, predicate, count(*), count_if(relevant) from labels"
+        " where not is_goal_object group by all",
+    )
+    found = {(split, shard, predicate): counts for split, shard, predicate, *counts in rows}
+    asked = {(s.family, predicate.name): None for s in planned for predicate in s.predicates}
+    made = []
+    for family, predicate in asked:
+        drawn = [s for s in sample if _asks(s, family, predicate)]
+        counts = [found.get((s.split, s.shard, predicate), (0, 0)) for s in drawn]
+        queries, relevant = (sum(column) for column in zip(*counts, strict=True))
+        for split in SPLITS:
+            mine = [s for s in planned if s.split == split and _asks(s, family, predicate)]
+            scenes = sum(s.count for s in mine)
+            factor = scenes / sum(s.count for s in drawn)
+            made.append(
+                Queries(
+                    group=group_of(predicate, family),
+                    split=split,
+                    scenes=scenes,
+                    relevant=round(relevant * factor),
+                    irrelevant=round((queries - relevant) * factor),
+                    sample=queries,
+                )
+            )
+    return tuple(made)
+
+
+def _asks(spec: ShardSpec, family: str, predicate: str) -> bool:
+    return spec.family == family and predicate in (p.name for p in spec.predicates)
 
 
 def actual(root: str | Path) -> Quantities:

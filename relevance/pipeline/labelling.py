@@ -120,7 +120,8 @@ def label_shard(
     """
     predicate = PREDICATES[str(predicate)]
     if predicate not in spec.predicates:
-        raise RelevanceError(f"{predicate.name}: expected a predicate of family {spec.family}")
+        names = ", ".join(p.name for p in spec.predicates)
+        raise RelevanceError(f"{predicate.name}: expected one that is asked there, {names}")
     by = POLICIES[policy or config.policy]
     dataset = Dataset.open(root)
     refuse_merged(dataset)

@@ -101,7 +101,7 @@ def prepare(
     if specs != old:
         refuse_other_scenes(there, config)
     # asking for fewer than there are keeps what there is
-    grown = {split: scenes_of(specs, split) for split in SPLITS}
+    grown = {split: scenes_of(specs, split, each=config.own_scenes) for split in SPLITS}
     grown = {**grown, "scenes_per_shard": config.scenes_per_shard}
     said = {**there.description, "config": dump_config(replace(before, **grown)), **_listed(specs)}
     wanted = replace(config, **grown)

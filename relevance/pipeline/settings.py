@@ -6,6 +6,7 @@ makes it, in whatever order.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
@@ -16,7 +17,7 @@ from relevance.configs import ConfigError, config, identity_hash
 from relevance.labels import LABELS_VERSION, POLICIES
 from relevance.planner import PLANNER_VERSION, PlannerConfig
 from relevance.sampling import SAMPLER_VERSION, GoalConfig, SceneConfig
-from relevance.scene import FAMILIES, PREDICATES, Predicate
+from relevance.scene import FAMILIES, Predicate, asked_of
 from relevance.simulation import RENDERER_VERSION
 from relevance.store import SPLITS, Dataset, DatasetError, Labelling
 
@@ -35,6 +36,7 @@ class Counts:
 
     same_plane: Natural = 0
     on: Natural = 0
+    stacks: Natural = 0
 
     def of(self, family: str) -> int:
         """Number of scenes of a family."""
@@ -73,6 +75,9 @@ class DatasetConfig:
     """Scenes to choose by."""
     test: Counts = field(default_factory=Counts)
     """Scenes that only evaluation sees."""
+    own_scenes: bool = False
+    """Whether each predicate has scenes of its own, that many each, as in the paper; else all
+    predicates of a family are asked of the same scenes."""
     scenes_per_shard: Positive = 100
     """Scenes in one unit of work."""
     goals_per_scene: Positive = 3
@@ -106,7 +111,11 @@ class DatasetConfig:
     @property
     def drawn_as(self) -> DatasetConfig:
         """The settings that change a scene, all others at their defaults."""
-        return DatasetConfig(seed=self.seed, scene=settings_of_family(self.scene, FAMILIES[0]))
+        return DatasetConfig(
+            seed=self.seed,
+            own_scenes=self.own_scenes,
+            scene=settings_of_family(self.scene, FAMILIES[0]),
+        )
 
     @property
     def planned_as(self) -> DatasetConfig:
@@ -160,9 +169,9 @@ class DatasetConfig:
     def demo(cls) -> DatasetConfig:
         """Minutes: enough for a small network to learn from."""
         return cls(
-            train=Counts(same_plane=1000, on=800),
-            validation=Counts(same_plane=60, on=80),
-            test=Counts(same_plane=40, on=60),
+            train=Counts(same_plane=1000, on=1600),
+            validation=Counts(same_plane=60, on=160),
+            test=Counts(same_plane=40, on=120),
             scenes_per_shard=100,
             goals_per_scene=6,
         )
@@ -171,20 +180,35 @@ class DatasetConfig:
     def laptop(cls) -> DatasetConfig:
         """Under an hour on two cores: enough to come close to the best accuracy."""
         return cls(
-            train=Counts(same_plane=10_000, on=10_000),
-            validation=Counts(same_plane=1_000, on=1_000),
-            test=Counts(same_plane=1_000, on=1_000),
+            train=Counts(same_plane=10_000, on=16_000, stacks=8_000),
+            validation=Counts(same_plane=1_000, on=1_000, stacks=800),
+            test=Counts(same_plane=1_000, on=1_600, stacks=800),
             scenes_per_shard=250,
             goals_per_scene=6,
         )
 
     @classmethod
+    def crowd(cls) -> DatasetConfig:
+        """Under half an hour on two cores: up to 30 boxes, plans of up to 12 actions."""
+        return cls(
+            train=Counts(same_plane=2_200, stacks=2_200),
+            validation=Counts(same_plane=150, stacks=150),
+            test=Counts(same_plane=250, stacks=250),
+            scenes_per_shard=50,
+            goals_per_scene=3,
+            scene=SceneConfig(min_objects=3, max_objects=30),
+            planner=PlannerConfig(max_actions=12),
+            test_replay_share=0.2,
+        )
+
+    @classmethod
     def paper(cls) -> DatasetConfig:
-        """A night and more: the paper's scale, its same-plane predicates sharing their scenes."""
+        """A day and more: the paper's scale, each predicate with scenes of its own."""
         return cls(
             train=Counts(same_plane=80_000, on=160_000),
-            validation=Counts(same_plane=2_000, on=2_000),
-            test=Counts(same_plane=2_000, on=2_000),
+            validation=Counts(same_plane=800, on=1_600),
+            test=Counts(same_plane=800, on=1_600),
+            own_scenes=True,
             scenes_per_shard=500,
             goals_per_scene=25,
         )
@@ -199,11 +223,13 @@ class ShardSpec:
     family: str
     first: int
     count: int
+    predicate: str | None = None
+    """The predicate that the scenes are for; None: all that are asked of the family."""
 
     @property
     def predicates(self) -> tuple[Predicate, ...]:
         """The predicates that its scenes are asked."""
-        return tuple(p for p in PREDICATES.values() if p.family == self.family)
+        return tuple(p for p in asked_of(self.family) if self.predicate in (None, p.name))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -232,20 +258,23 @@ def settings_of_family(settings: SceneConfig, family: str) -> SceneConfig:
     return replace(settings, family=family)
 
 
-def scenes_of(specs: Iterable[ShardSpec], split: str) -> Counts:
-    """How many scenes the shards of a split have."""
-    mine = [spec for spec in specs if spec.split == split]
-    return Counts.by_family(
-        {f: sum(spec.count for spec in mine if spec.family == f) for f in FAMILIES}
-    )
+def scenes_of(specs: Iterable[ShardSpec], split: str, *, each: bool = False) -> Counts:
+    """How many scenes the shards of a split have, or of `each` predicate with its own."""
+    scenes = {family: Counter[str | None]() for family in FAMILIES}
+    for spec in specs:
+        if spec.split == split:
+            scenes[spec.family][spec.predicate] += spec.count
+    count = max if each else sum
+    return Counts.by_family({f: count(found.values() or [0]) for f, found in scenes.items()})
 
 
 def shard_specs(config: DatasetConfig, finished: list[ShardSpec] | None = None) -> list[ShardSpec]:
     """Every shard of a config; `finished` ones stay as they are, more are appended to them."""
     specs = list(finished or ())
     for split in SPLITS:
-        for family in FAMILIES:
-            have = sum(s.count for s in specs if (s.split, s.family) == (split, family))
+        for family, predicate in _asked(config):
+            wanted = (split, family, predicate)
+            have = sum(s.count for s in specs if (s.split, s.family, s.predicate) == wanted)
             missing = config.counts(split).of(family) - have
             while missing > 0:
                 mine = [s for s in specs if s.split == split]
@@ -257,10 +286,18 @@ def shard_specs(config: DatasetConfig, finished: list[ShardSpec] | None = None) 
                         family=family,
                         first=sum(s.count for s in mine),
                         count=count,
+                        predicate=predicate,
                     )
                 )
                 missing -= count
     return sorted(specs, key=lambda s: (SPLITS.index(s.split), s.shard))
+
+
+def _asked(config: DatasetConfig) -> list[tuple[str, str | None]]:
+    """What scenes are drawn for: families, or each family's predicates with their own."""
+    if not config.own_scenes:
+        return [(family, None) for family in FAMILIES]
+    return [(family, predicate.name) for family in FAMILIES for predicate in asked_of(family)]
 
 
 def load_config(dataset: Dataset) -> DatasetConfig:

@@ -27,9 +27,10 @@ from relevance.report.style import (
     GROUPS,
     SPLIT_COLOR,
     family_color,
+    named,
 )
 from relevance.report.tables import Statistics, Table, cell, statistics
-from relevance.scene import PREDICATES
+from relevance.scene import FAMILIES
 from relevance.store import Dataset
 
 PAGE = "README.md"
@@ -52,6 +53,11 @@ def write_card(root: str | Path, out: str | Path) -> Path:
         if figure is not None:
             figure.savefig(out / f"{name}.png", dpi=_DPI, metadata={"Software": None})
             pictures[name] = title
+    for family in FAMILIES:
+        drawn = _drawn(dataset, family)
+        if drawn is not None:
+            drawn.savefig(out / f"scenes-{family}.png", dpi=_DPI, metadata={"Software": None})
+            pictures[f"scenes-{family}"] = f"Random scenes of family {family}"
     examples = _examples(dataset)
     if examples is not None:
         examples.savefig(out / "examples.png", dpi=_DPI, metadata={"Software": None})
@@ -153,22 +159,22 @@ def _balance(found: Statistics) -> dict[str, tuple[int, int]]:
     """Queries and relevant ones of each family."""
     sums: dict[str, tuple[int, int]] = {group: (0, 0) for group in GROUPS}
     for row in _dicts(found["label_balance"]):
-        family = PREDICATES[row["predicate"]].family
+        family = row["family"]
         queries, relevant = sums[family]
         sums[family] = queries + row["queries"], relevant + row["relevant"]
     return sums
 
 
 def _label_balance(found: Statistics) -> Figure | None:
-    rows = [row for row in _dicts(found["label_balance"]) if row["queries"]]
+    rows = named(row for row in _dicts(found["label_balance"]) if row["queries"])
     if not rows:
         return None
     figure, (ax,) = _figure(1)
-    predicates = [name for name in PREDICATES if any(r["predicate"] == name for r in rows)]
+    predicates = list(dict.fromkeys(row["group"] for row in rows))
     splits = [s for s in SPLIT_COLOR if any(r["split"] == s for r in rows)]
     width = 0.8 / len(splits)
     for i, split in enumerate(splits):
-        mine = {row["predicate"]: row["relevant_share"] for row in rows if row["split"] == split}
+        mine = {row["group"]: row["relevant_share"] for row in rows if row["split"] == split}
         at = np.array([predicates.index(p) for p in mine]) + (i - (len(splits) - 1) / 2) * width
         ax.bar(at, [100 * s for s in mine.values()], width, label=split, color=SPLIT_COLOR[split])
     ax.set_xticks(range(len(predicates)), predicates)
@@ -203,7 +209,7 @@ def _lengths(found: Statistics) -> Figure | None:
         (left, lengths, "n_actions", "actions of the plan"),
         (right, blockers, "blockers", "objects in the way"),
     ):
-        _shares(ax, rows, key, "plans", lambda row: PREDICATES[row["predicate"]].family)
+        _shares(ax, rows, key, "plans", lambda row: row["family"])
         ax.set_xlabel(label)
     left.legend(fontsize=8, frameon=False)
     return figure
@@ -275,11 +281,11 @@ def _general(reason: str) -> str:
 
 
 def _seconds(found: Statistics) -> Figure | None:
-    rows = _dicts(found["bound_seconds"])
+    rows = named(_dicts(found["bound_seconds"]))
     if not rows:
         return None
     figure, (ax,) = _figure(1, 2.4)
-    names = [row["predicate"] for row in rows]
+    names = [row["group"] for row in rows]
     left = np.zeros(len(rows))
     for part, color in BOUND_COLOR.items():
         widths = np.array([1000 * (row[part] or 0.0) / row["goals"] for row in rows])
@@ -300,23 +306,53 @@ _PICTURES: dict[str, tuple[str, Callable[[Statistics], Figure | None]]] = {
 }
 
 
+_SHOWN = 12
+"""Random scenes of each family in the card."""
+
+
+def _drawn(dataset: Dataset, family: str) -> Figure | None:
+    """Some scenes of a family, drawn by the hash of their ids."""
+    with dataset.connect() as connection:
+        rows = connection.execute(
+            "SELECT scene_id, split, shard FROM scenes WHERE family = ?"
+            " ORDER BY md5(scene_id) LIMIT ?",
+            [family, _SHOWN],
+        ).fetchall()
+    if not rows:
+        return None
+    wanted = {scene_id for scene_id, _, _ in rows}
+    images = {
+        sample.key: sample.image
+        for split, shard in sorted({(split, shard) for _, split, shard in rows})
+        for sample in dataset.samples(split, [shard])
+        if sample.key in wanted
+    }
+    figure = Figure(figsize=(_WIDTH, 1.12 * -(-len(rows) // 4)), layout="constrained")
+    grid = figure.subplots(-(-len(rows) // 4), 4, squeeze=False).ravel()
+    for ax in grid:
+        ax.set_axis_off()
+    for ax, (scene_id, _, _) in zip(grid, rows, strict=False):
+        ax.imshow(images[scene_id])
+    return figure
+
+
 _EXAMPLES = """
     SELECT
-        p.scene_id, p.split, p.shard, p.predicate, p.subject, p.reference, p.n_actions,
+        p.scene_id, p.split, p.shard, f.family, p.predicate, p.subject, p.reference, p.n_actions,
         coalesce(l.relevant, []) AS relevant
-    FROM plans AS p LEFT JOIN (
+    FROM plans AS p LEFT JOIN shard_families AS f USING (split, shard) LEFT JOIN (
         SELECT plan_id, list(query) FILTER (relevant) AS relevant FROM labels GROUP BY plan_id
     ) AS l USING (plan_id)
     WHERE p.holds
     QUALIFY row_number() OVER (
-        PARTITION BY p.predicate
+        PARTITION BY f.family, p.predicate
         ORDER BY p.split <> 'test', least(p.n_actions, 4) DESC, md5(p.plan_id)) = 1
-    ORDER BY p.predicate
+    ORDER BY f.family, p.predicate
 """
 
 
 def _examples(dataset: Dataset) -> Figure | None:
-    """One scene for each predicate, with what is relevant in it."""
+    """One scene for each predicate of each family, with what is relevant in it."""
     with dataset.connect() as connection:
         found = connection.execute(_EXAMPLES)
         names = [column[0] for column in found.description or ()]

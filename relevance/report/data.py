@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from relevance.report import plots
-from relevance.report.style import GROUPS, groups
-from relevance.scene import PREDICATES
+from relevance.report.style import GROUPS, named
 from relevance.store import SPLITS
 
 
@@ -14,24 +13,24 @@ def data_section(rows: Any) -> dict[str, Any]:
     """Scenes, label balance and plan lengths."""
     shares = rows(
         """
-        select predicate, split, goals, solved, plans, queries, relevant, relevant_share
+        select family, predicate, split, goals, solved, plans, queries, relevant, relevant_share
         from paper_label_distribution where n_actions = 'all'
         """
     )
-    pooled = rows(
-        """
-        select predicate, sum(queries)::bigint as queries,
-            sum(relevant) / nullif(sum(queries), 0) as relevant_share
-        from paper_label_distribution
-        where n_actions = 'all' and predicate in (select predicate from plans)
-        group by predicate
-        """
+    pooled = named(
+        rows(
+            """
+            select family, predicate, sum(queries)::bigint as queries,
+                sum(relevant) / nullif(sum(queries), 0) as relevant_share
+            from paper_label_distribution
+            where n_actions = 'all' and predicate <> 'all'
+            group by family, predicate
+            """
+        )
     )
-    order = [p for p in PREDICATES if p in {row["predicate"] for row in pooled}]
-    pooled.sort(key=lambda row: order.index(row["predicate"]))
     lengths = rows(
         """
-        select predicate, n_actions, count(*) as plans from plans where holds group by all
+        select family, n_actions, sum(plans)::bigint as plans from plan_lengths group by all
         order by n_actions
         """
     )
@@ -58,39 +57,43 @@ def data_section(rows: Any) -> dict[str, Any]:
 
 
 def _in_order(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    order = groups()
-    return sorted(rows, key=lambda r: (order.index(r["predicate"]), SPLITS.index(r["split"])))
+    return named(sorted(rows, key=lambda row: SPLITS.index(row["split"])))
 
 
 def planner_section(rows: Any) -> dict[str, Any]:
     """Verdicts, times and failures."""
-    verdicts = rows(
-        """
-        select predicate, sum(goals)::bigint as goals, sum(solved)::bigint as solved,
-            sum(plans)::bigint as plans, sum(ambiguous)::bigint as ambiguous,
-            sum(replayed)::bigint as replayed, sum(replay_ok)::bigint as replay_ok,
-            max(max_penetration) as deepest, max(replay_max_penetration) as replay_deepest
-        from plan_verdicts group by predicate
-        """
+    verdicts = named(
+        rows(
+            """
+            select family, predicate, sum(goals)::bigint as goals, sum(solved)::bigint as solved,
+                sum(plans)::bigint as plans, sum(ambiguous)::bigint as ambiguous,
+                sum(replayed)::bigint as replayed, sum(replay_ok)::bigint as replay_ok,
+                max(max_penetration) as deepest, max(replay_max_penetration) as replay_deepest
+            from plan_verdicts group by family, predicate
+            """
+        )
     )
-    verdicts.sort(key=lambda row: list(PREDICATES).index(row["predicate"]))
-    seconds = rows(
-        """
-        select predicate, count(*) as n, avg(seconds) as mean, median(seconds) as median,
-            quantile_cont(seconds, 0.9) as p90, max(seconds) as longest,
-            avg(seconds_pose) as pose, avg(seconds_keyframe) as keyframe, avg(seconds_path) as path
-        from timings group by predicate
-        """
+    seconds = named(
+        rows(
+            """
+            select family, predicate, count(*) as n, avg(seconds) as mean,
+                median(seconds) as median, quantile_cont(seconds, 0.9) as p90,
+                max(seconds) as longest, avg(seconds_pose) as pose,
+                avg(seconds_keyframe) as keyframe, avg(seconds_path) as path
+            from timings left join shard_families using (split, shard) group by family, predicate
+            """
+        )
     )
-    seconds.sort(key=lambda row: list(PREDICATES).index(row["predicate"]))
-    counts = rows(
-        """
-        select predicate, avg(nodes) as nodes, avg(pose_checks) as pose,
-            avg(keyframe_nlps) as keyframe, avg(path_nlps) as path
-        from plans group by predicate
-        """
+    counts = named(
+        rows(
+            """
+            select family, predicate, avg(nodes) as nodes, avg(pose_checks) as pose,
+                avg(keyframe_nlps) as keyframe, avg(path_nlps) as path
+            from plans left join shard_families using (split, shard) group by family, predicate
+            """
+        )
     )
-    counts_of = {row["predicate"]: row for row in counts}
+    counts_of = {row["group"]: row for row in counts}
     reasons = rows(
         """
         -- what names objects differs from goal to goal; what ended the search comes last
@@ -120,7 +123,7 @@ def planner_section(rows: Any) -> dict[str, Any]:
     return {
         "verdicts": verdicts,
         "total": total,
-        "seconds": [row | {"counts": counts_of.get(row["predicate"], {})} for row in seconds],
+        "seconds": [row | {"counts": counts_of.get(row["group"], {})} for row in seconds],
         "median": middle["median"],
         "n_timed": middle["n"],
         "versions": versions,

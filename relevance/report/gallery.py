@@ -60,11 +60,13 @@ def choose_examples(
         with tasks as (
             select *, len(list_filter(moved, lambda name: name not in (subject, reference)))
                 as n_blockers
-            from plans where split = 'test' and holds
+            from plans left join shard_families using (split, shard)
+            where split = 'test' and holds
         )
         select * from (
             select *, row_number() over (
-                partition by predicate order by least(n_blockers, 2) desc, md5(plan_id)) as nth
+                partition by family, predicate
+                order by least(n_blockers, 2) desc, md5(plan_id)) as nth
             from tasks)
         where nth <= ?
         """,

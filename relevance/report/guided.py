@@ -11,12 +11,13 @@ from relevance.evaluation import (
     left_out,
     read_evaluations,
     settings,
+    shown_as,
     summarise,
 )
 from relevance.report import plots
 from relevance.report.gallery import anchor
 from relevance.report.style import GROUPS
-from relevance.scene import PREDICATES
+from relevance.report.style import groups as shown_groups
 from relevance.store import Dataset
 
 
@@ -53,9 +54,9 @@ def _search(
     working: dict[str, list[dict[str, Any]]],
     of_search: dict[tuple[str, float], list[dict[str, Any]]],
 ) -> dict[str, Any]:
-    present = {row["predicate"] for rows in working.values() for row in rows}
+    present = {shown_as(row) for rows in working.values() for row in rows}
     families = [g for g in GROUPS if any(in_group(p, g) for p in present)]
-    groups = [*families, *(p for p in PREDICATES if p in present and p not in families), "all"]
+    groups = [*(g for g in shown_groups() if g in {*families, *present}), "all"]
     comparisons = [(g, [summarise(rows, g) for rows in working.values()]) for g in groups]
     solvable = {g: [r for r in rows if r["solved_unguided"]] for g, rows in working.items()}
     drawn: dict[str, str] = {}

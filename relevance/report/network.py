@@ -11,7 +11,6 @@ import numpy as np
 from relevance.evaluation import Predictions, read_predictions, unjudged
 from relevance.metrics import Accuracy
 from relevance.report import plots
-from relevance.report.style import GROUPS
 from relevance.report.style import groups as shown_groups
 from relevance.store import Dataset
 
@@ -42,7 +41,7 @@ def network_section(
     model["with_goal_objects"] = [(group, everything.of(group).accuracy()) for group in groups]
     model["tuned"] = _tuned(predictions, groups, model["chosen"])
     model["n_tasks"] = len(np.unique(predictions.task))
-    panels = len(GROUPS)
+    panels = len(plots.families_in(predictions))
     model["plots"] |= {
         "accuracy": plots.svg("accuracy", plots.accuracy, size=(4.8, 3.8), predictions=predictions),
         "beta": plots.svg(

@@ -52,6 +52,8 @@ class Paper:
     """By predicate: half of the 67% intervals of its unguided and guided times, s."""
     scenes: Mapping[str, int]
     """By predicate: scenes to train on."""
+    test_scenes: Mapping[str, int]
+    """By predicate: scenes to test on."""
     train: Mapping[str, Queries]
     """By group."""
     test: Mapping[str, Queries]
@@ -91,6 +93,7 @@ def paper() -> Paper:
         | {f["name"]: Runtime(f["unguided"], f["guided"], f["saved"]) for f in families},
         spread={p["name"]: (p["unguided"][1], p["guided"][1]) for p in predicates},
         scenes={p["name"]: p["scenes"] for p in predicates},
+        test_scenes={p["name"]: p["test_scenes"] for p in predicates},
         train=queries["train"],
         test=queries["test"],
         eta={f["name"]: f["eta"] for f in families},

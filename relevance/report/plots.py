@@ -38,9 +38,10 @@ from relevance.report.style import (
     VIOLET,
     family_color,
     guide_style,
+    pooled,
     seconds,
 )
-from relevance.scene import PREDICATES
+from relevance.report.style import groups as shown_groups
 
 QUANTILES = np.linspace(0, 1, 201)
 """Shares at which distributions of times are drawn; the middle one is the median."""
@@ -88,16 +89,16 @@ def _log_seconds(ax: Axes, which: str) -> None:
 
 
 def label_shares(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
-    groups = [row["predicate"] for row in rows]
+    groups = [row["group"] for row in rows]
     y = np.arange(len(rows))[::-1]
     shares = [row["relevant_share"] or 0.0 for row in rows]
-    colors = [family_color(PREDICATES[group].family) for group in groups]
+    colors = [family_color(group) for group in groups]
     ax.barh(y, shares, height=0.56, color=colors)
     end = max([*shares, 0.3]) * 1.08
     for at, row, share in zip(y, rows, shares, strict=True):
         text = f"{100 * share:.1f}% of {row['queries']}"
         ax.text(end * 1.03, at, text, va="center", fontsize=8.5)
-        theirs = paper().train.get(row["predicate"])
+        theirs = paper().train.get(row["group"])
         if theirs:
             ax.plot([theirs.share] * 2, [at - 0.38, at + 0.38], color=INK, linewidth=1.6)
     ax.set_yticks(y, groups)
@@ -113,11 +114,11 @@ def lengths(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     for number, group in enumerate(GROUPS):
         counts = Counter()
         for row in rows:
-            if PREDICATES[row["predicate"]].family == group:
+            if row["family"] == group:
                 counts[row["n_actions"]] += row["plans"]
         total = sum(counts.values())
         if total:
-            at = np.arange(len(lengths)) + (number - 0.5) * width
+            at = np.arange(len(lengths)) + (number - (len(GROUPS) - 1) / 2) * width
             shares = [counts[length] / total for length in lengths]
             label = f"{group} (n = {total})"
             ax.bar(at, shares, width * 0.92, color=family_color(group), label=label)
@@ -160,8 +161,13 @@ def times(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     ax.set_xlim(right=max(20.0, *(row["quantiles"][-1] for row in rows)))
 
 
+def families_in(predictions: Predictions) -> list[str]:
+    """The families that there are predictions of: a panel each."""
+    return [group for group in GROUPS if len(predictions.of(group))]
+
+
 def accuracy(ax: Axes, predictions: Predictions) -> None:
-    groups = [p for p in PREDICATES if len(predictions.of(p))]
+    groups = [g for g in shown_groups() if not pooled(g) and len(predictions.of(g))]
     for number, (label, attribute, color) in enumerate(SHARES):
         for row, group in enumerate(groups):
             y = len(groups) - 1 - row + (1 - number) * 0.22
@@ -185,7 +191,7 @@ def accuracy(ax: Axes, predictions: Predictions) -> None:
 
 
 def beta_accuracy(*axes: Axes, predictions: Predictions) -> None:
-    for ax, group in zip(axes, GROUPS, strict=True):
+    for ax, group in zip(axes, families_in(predictions), strict=True):
         part = predictions.of(group)
         ax.set_title(f"{group} (n = {len(np.unique(part.task))} tasks)")
         ax.set_xlabel("beta (larger keeps more)")
@@ -204,7 +210,7 @@ def beta_accuracy(*axes: Axes, predictions: Predictions) -> None:
 
 
 def scores(*axes: Axes, predictions: Predictions) -> None:
-    for ax, group in zip(axes, GROUPS, strict=True):
+    for ax, group in zip(axes, families_in(predictions), strict=True):
         part = predictions.of(group)
         ax.set_title(group)
         ax.set_xlabel("score (logit)")

@@ -6,11 +6,12 @@ A family has one colour everywhere, and so has a guide, a split and a bound.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from relevance.planner import GUIDES
-from relevance.scene import FAMILIES, PREDICATES
+from relevance.scene import FAMILIES, PREDICATES, group_of
 
 GROUPS = FAMILIES
 """Families, in the order in which tables and plots show them."""
@@ -58,13 +59,36 @@ def guide_style(name: str) -> GuideStyle:
 
 
 def groups() -> list[str]:
-    """Rows of tables, in order: families, then predicates; a name of both comes once."""
-    return [*(family for family in FAMILIES if family not in PREDICATES), *PREDICATES]
+    """Rows of tables, in order: each family, then its predicates; a name of both comes once."""
+    names = [
+        name
+        for family in FAMILIES
+        for name in (family, *(p.name for p in PREDICATES.values() if p.family == family))
+    ]
+    return list(dict.fromkeys([*names, *PREDICATES]))
+
+
+def pooled(group: str) -> bool:
+    """Whether a row sums up others: a family that is not shown as one predicate alone."""
+    own = [p.name for p in PREDICATES.values() if p.family == group]
+    return bool(own) and group not in own
+
+
+def named(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows with family and predicate, each with the `group` that it is shown as, in order."""
+    found = [row | {"group": _named(row["predicate"], row["family"])} for row in rows]
+    order = groups()
+    return sorted(found, key=lambda row: order.index(row["group"]))
+
+
+def _named(predicate: str, family: str | None) -> str:
+    return str(family) if predicate == "all" else group_of(predicate, family)
 
 
 def family_color(name: str) -> str:
-    """Colour of a family of scenes."""
-    return {"same-plane": BLUE, "on": ORANGE}.get(name) or _spare(name)
+    """Colour of a family of scenes, or of the one that a predicate belongs to."""
+    family = PREDICATES[name].family if name in PREDICATES else name
+    return {"same-plane": BLUE, "on": ORANGE, "stacks": GREEN}.get(family) or _spare(family)
 
 
 def _spare(name: str) -> str:

@@ -7,11 +7,12 @@ sees every box and the arm can reach it from above, and whether it is *useful* i
 
 Goal regions that are free need no extra action, so uniformly scattered boxes give almost no
 relevant objects (2 to 4% of the queries). Scenes are therefore dense where it matters: boxes
-stand squarely in the goal regions of others (`crowding`), and in `on` scenes many of them carry
-another (`stacking`). Which of the valid goals are asked follows stated odds (`GoalConfig`) that
-look at the stacks, never at plans. With the defaults about 13% (same-plane) and 27% (`on`) of
-the queries are relevant; in the paper 14% and 30%. All of it is configuration, hence in every
-row's hash.
+stand squarely in the goal regions of others (`crowding`). An `on` scene is the paper's: a random
+target that carries one other box, few more boxes, and every goal asks to stand on that target.
+In `stacks`, which is ours, many boxes carry another (`stacking`); which of the valid goals are
+asked follows stated odds (`GoalConfig`) that look at the stacks. Nothing looks at plans. With the
+defaults about 14% (same-plane) and 30% (`on`) of the queries are relevant; in the paper 14% and
+30%. All of it is configuration, hence in every row's hash.
 """
 
 from relevance.sampling.goals import sample_goals

@@ -26,6 +26,7 @@ def sample_goals(
     goals keeps the earlier ones. Fewer than `count` come back when the scene has no more.
     """
     carrying = {name for box in scene.objects for name in box.supports}
+    alone = predicate.stacked and sum(bool(box.supports) for box in scene.objects) == 1
     goals: list[Goal] = []
     weights: list[float] = []
     on_carrier: list[bool] = []
@@ -35,6 +36,9 @@ def sample_goals(
         for reference in scene.objects:
             # A reference that stands on its own subject would be lifted away with it.
             if reference.name == subject.name or subject.name in reference.supports:
+                continue
+            # One box stacked on a target: the question is whether it has to go (the paper's).
+            if alone and reference.name not in carrying:
                 continue
             goal = Goal(predicate=predicate, subject=subject.name, reference=reference.name)
             if goal_holds(scene.objects, goal, scene.robot):

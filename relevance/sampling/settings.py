@@ -15,7 +15,7 @@ from relevance.sampling.colors import MOST
 from relevance.scene import FAMILIES, Camera, Light, Robot, Table, pinhole
 from relevance.scene.contacts import check_robot
 
-SAMPLER_VERSION = "1"
+SAMPLER_VERSION = "2"
 """Raised when equal settings and counters come to give another scene or other goals: a default,
 a draw or its order changed. Stored scenes keep the version that drew them."""
 
@@ -79,21 +79,26 @@ class SceneConfig:
     family: Annotated[
         str, _expect(lambda name: name in FAMILIES, f"one of {', '.join(FAMILIES)}")
     ] = "same-plane"
-    """`same-plane`: all boxes on the table. `on`: one box more, and some on top of others."""
+    """`same-plane`: all boxes on the table. `on`: few boxes, one of them on another (the paper's).
+    `stacks`: many boxes, up to half of them on others."""
     min_objects: Annotated[int, Field(ge=2)] = 3
-    """Fewest boxes (the `on` family adds one)."""
+    """Fewest boxes (`stacks` adds one)."""
     max_objects: Annotated[int, _expect(lambda n: n < MOST, f"under {MOST} (distinct colours)")] = (
         10
     )
-    """Most boxes (the `on` family adds one)."""
+    """Most boxes (`stacks` adds one)."""
+    on_objects: Annotated[
+        tuple[int, int], _expect(lambda n: 3 <= n[0] <= n[1] <= MOST, f"3 <= from <= to <= {MOST}")
+    ] = (3, 5)
+    """Fewest and most boxes of an `on` scene, the stacked one among them."""
     crowding: Share = 1.0
     """Probability that a box is drawn into a goal region of an earlier one (same-plane)."""
     crowding_on: Share = 0.0
-    """The same for the boxes on the table of an `on` scene."""
-    choices: Annotated[int, Field(ge=1)] = 3
+    """The same for the boxes on the table of an `on` or `stacks` scene."""
+    choices: Annotated[int, Field(ge=1)] = 8
     """Free places of which a crowded box takes the one that closes most goal regions."""
     stacking: Share = 0.7
-    """Probability that a box of an `on` scene stands on another (one always does; stacks are
+    """Probability that a box of a `stacks` scene stands on another (one always does; stacks are
     two high, so at most every second box)."""
     stack_height: float = 0.15
     """Tallest stack, m; taller ones hide what is behind them."""
@@ -161,6 +166,14 @@ class SceneConfig:
         )
 
     @property
+    def numbers(self) -> tuple[int, int]:
+        """Fewest and most boxes of a scene of this family."""
+        if self.family == "on":
+            return self.on_objects
+        more = self.family == "stacks"
+        return self.min_objects + more, self.max_objects + more
+
+    @property
     def content_hash(self) -> str:
         """16 hex digits that depend on the settings alone."""
         return content_hash(self)
@@ -171,6 +184,7 @@ class GoalConfig:
     """The odds of goals; they look at who carries whom, never at plans."""
 
     carrying_reference: Annotated[float, Field(gt=0, lt=1)] = 0.98
-    """Share of `on` goals whose reference carries a box already, where the scene has one."""
+    """Share of `on` goals whose reference carries a box already, where several boxes carry one;
+    where a single one does, it is always the reference."""
     carrying_subject: Annotated[float, Field(gt=0)] = 30.0
     """How likely a box that carries another is drawn as subject, relative to one that does not."""

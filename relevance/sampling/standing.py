@@ -92,7 +92,7 @@ class Standing:
         turn = config.robot.yaw
         self._turn = math.cos(turn), math.sin(turn)
         self._eye, self._axes, self._focal = pinhole(camera)
-        most = config.max_objects + 1
+        most = config.numbers[1]
         self._shown = _Shown(
             np.empty((most, UPRIGHT)),
             np.empty((most, 4)),

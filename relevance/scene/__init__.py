@@ -31,7 +31,9 @@ from relevance.scene.predicates import (
     Goal,
     Predicate,
     Rectangle,
+    asked_of,
     goal_holds,
+    group_of,
 )
 from relevance.scene.projection import camera_up, pinhole, project, vertices
 from relevance.scene.reading import read_scenes, scene_from_json, scene_to_json
@@ -58,9 +60,11 @@ __all__ = [
     "SceneError",
     "Table",
     "Texture",
+    "asked_of",
     "camera_up",
     "footprint_gap",
     "goal_holds",
+    "group_of",
     "lab",
     "lookalikes",
     "pinhole",

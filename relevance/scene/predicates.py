@@ -53,6 +53,8 @@ class Predicate(ABC):
     """As goals are written: `on-the-left`."""
     family: str
     """The scene family that its datasets are made of."""
+    also: tuple[str, ...] = ()
+    """Other families that are asked it; figures of those are kept apart, see `group_of`."""
     mirror: str
     """The name of what it becomes when y changes sign; its own where that changes nothing."""
 
@@ -140,12 +142,25 @@ for _predicate in (
     Beside(name="on-the-right", family="same-plane", mirror="on-the-left", toward=(0.0, -1.0)),
     Beside(name="in-front", family="same-plane", mirror="in-front", toward=(-1.0, 0.0)),
     Beside(name="behind", family="same-plane", mirror="behind", toward=(1.0, 0.0)),
-    OnTop(name="on", family="on", mirror="on"),
+    OnTop(name="on", family="on", also=("stacks",), mirror="on"),
 ):
     PREDICATES.register(_predicate.name, _predicate)
 
-FAMILIES = ("same-plane", "on")
+FAMILIES = ("same-plane", "on", "stacks")
 """The kinds of scenes that predicates are asked of."""
+
+
+def asked_of(family: str) -> tuple[Predicate, ...]:
+    """The predicates that scenes of a family are asked."""
+    return tuple(p for p in PREDICATES.values() if family in (p.family, *p.also))
+
+
+def group_of(predicate: str, family: str | None) -> str:
+    """What figures of a predicate in a family are shown as: the predicate in its own family (or
+    when the family is not known), else that other family, which only borrows it."""
+    if family is None or predicate not in PREDICATES:
+        return predicate
+    return predicate if family == PREDICATES[predicate].family else family
 
 
 def _named(value: Any) -> Any:

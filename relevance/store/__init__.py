@@ -20,7 +20,7 @@ from relevance.store.paths import (
     replacing,
     sweep,
 )
-from relevance.store.queries import sql
+from relevance.store.queries import replanned, sql
 from relevance.store.synthetic import synthetic_labels
 from relevance.store.tables import (
     SCHEMAS,
@@ -57,6 +57,7 @@ __all__ = [
     "is_remote",
     "locate",
     "replacing",
+    "replanned",
     "sql",
     "sweep",
     "synthetic_labels",

@@ -83,6 +83,32 @@ def sql(
             raise DatasetError(f"query: {one_line(error)}") from None
 
 
+def replanned(
+    new: str | Path, old: str | Path | None = None
+) -> tuple[list[str], list[tuple[Any, ...]]]:
+    """Columns and rows of the view `replanned`: what planning anew changed in a dataset.
+
+    Compared with what it keeps beside its current labels, or with those of another folder, `old`,
+    a copy of the same scenes that was labelled otherwise. Raises DatasetError when they have no
+    planned goal in common.
+    """
+    with connect(Files.open(new)) as connection:
+        if old is not None:
+            with connect(Files.open(old)) as before:
+                for table in ("plans", "labels"):
+                    connection.register(
+                        f"old_{table}", before.sql(f"FROM {table}").to_arrow_table()
+                    )
+                    connection.execute(f"CREATE OR REPLACE VIEW beside_{table} AS FROM old_{table}")
+        found = connection.execute("FROM replanned")
+        names = [column[0] for column in found.description or ()]
+        rows = found.fetchall()
+    if not rows:
+        against = "other labels beside it" if old is None else f"goals of {old}"
+        raise DatasetError(f"{new}: has no planned goal in common with {against}")
+    return names, rows
+
+
 def _own(dataset: Files) -> str | None:
     return dataset.labelling.policy if dataset.labelling else None
 

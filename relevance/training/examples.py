@@ -63,12 +63,15 @@ class Examples:
     """(S, N) bool."""
     names: tuple[str, ...]
     """Ids of the scenes, S."""
+    families: tuple[str | None, ...]
+    """What kinds of scenes they are, S."""
     goals: dict[Predicate, Goals]
 
-    def scenes(self, predicates: Sequence[Predicate]) -> np.ndarray:
-        """Indices of the scenes that have a goal of one of the predicates."""
+    def scenes(self, predicates: Sequence[Predicate], family: str | None = None) -> np.ndarray:
+        """Indices of the scenes, of one family if it is given, that have a goal of a predicate."""
         counts = sum(np.diff(self.goals[predicate].first) for predicate in predicates)
-        return np.flatnonzero(counts)
+        found = np.flatnonzero(counts)
+        return found if family is None else found[[self.families[i] == family for i in found]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,6 +117,7 @@ def load_examples(
     policy: str = "found",
     ambiguous: bool = True,
     predicates: Sequence[str] = (),
+    families: Sequence[str] = (),
     cache_bytes: int = 1_500_000_000,
     folder: Path | None = None,
 ) -> Examples:
@@ -121,21 +125,22 @@ def load_examples(
 
     Raises DatasetError for a broken file, labels that were not all made in one way, a label about
     a scene that is not there, or an image of another size than the camera's. Arrays over
-    `cache_bytes` are mapped from a nameless file in `folder`. `predicates` are those whose
-    labels are read, all when empty.
+    `cache_bytes` are mapped from a nameless file in `folder`. `predicates` and
+    `families` are those whose labels are read, all when empty.
     """
     one_labelling(dataset, split, policy)
     query = """
         select scene_id, predicate, subject, reference, list(query order by query),
-            list(relevant order by query)
-        from labels where split = ? and policy = ? and (? or not ambiguous)
+            list(relevant order by query), family
+        from labels left join shard_families using (split, shard)
+        where split = ? and policy = ? and (? or not ambiguous)
             and (? or predicate in (select unnest(?::varchar[])))
+            and (? or family in (select unnest(?::varchar[])))
         group by all order by all
     """
     with dataset.connect(policy=policy) as connection:
-        rows = connection.execute(
-            query, [split, policy, ambiguous, not predicates, list(predicates)]
-        ).fetchall()
+        asked_for = [not predicates, list(predicates), not families, list(families)]
+        rows = connection.execute(query, [split, policy, ambiguous, *asked_for]).fetchall()
     labels: dict[str, list[tuple[Any, ...]]] = {
         key: list(group) for key, group in groupby(rows, key=lambda row: row[0])
     }
@@ -150,6 +155,7 @@ def load_examples(
     present = np.zeros((total, objects), bool)
     found: dict[Predicate, list[tuple[int, list[int], np.ndarray, np.ndarray]]] = {}
     names: list[str] = []
+    kinds: list[str | None] = []
     done = 0
     for sample in dataset.samples(split) if total else ():
         asked = labels.pop(sample.scene.id, None)
@@ -167,13 +173,14 @@ def load_examples(
         geometry[done, :count] = true_geometry(sample.scene)
         present[done, :count] = True
         place = {name: i for i, name in enumerate(sample.scene.names)}
-        for _, predicate, subject, reference, queries, answers in asked:
+        for _, predicate, subject, reference, queries, answers, _ in asked:
             relevant, labelled = np.zeros(objects, bool), np.zeros(objects, bool)
             index = [place[query] for query in queries]
             relevant[index], labelled[index] = answers, True
             pair = [place[subject], place[reference]]
             found.setdefault(PREDICATES[predicate], []).append((done, pair, relevant, labelled))
         names.append(sample.scene.id)
+        kinds.append(asked[0][-1])
         done += 1
     if labels:
         raise DatasetError(
@@ -188,6 +195,7 @@ def load_examples(
         geometry=geometry,
         present=present,
         names=tuple(names),
+        families=tuple(kinds),
         goals=goals,
     )
 

@@ -46,6 +46,8 @@ class TrainConfig:
     predicates: tuple[str, ...] = ()
     """What one network learns; all that are labelled when empty. (The paper trains one for the
     four same-plane predicates and another for `on`.)"""
+    families: tuple[str, ...] = ()
+    """The families of scenes that are learned from; all when empty. (`on` is asked of two.)"""
     start: str = ""
     """Id of a checkpoint of the dataset whose weights are taken over and stay as they are: only
     heads that it lacks are trained, those of `predicates`."""
@@ -124,7 +126,8 @@ class TrainConfig:
     def paper(cls) -> Self:
         """The paper's ViT by its bare recipe: Adam at 1e-5 on batches of 50 queries, nothing else.
 
-        For its network for `on`, give `--predicates on`; for its other bodies, `--model.body`.
+        For its network for `on`, give `--predicates on --families on`; for its other bodies,
+        `--model.body`.
         """
         return cls(
             preset="paper",

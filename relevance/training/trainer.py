@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ import torch
 from relevance.errors import RelevanceError
 from relevance.metrics import accuracy
 from relevance.models import RelevanceModel
-from relevance.scene import PREDICATES
+from relevance.scene import PREDICATES, group_of
 from relevance.store import Dataset, DatasetError, locate
 from relevance.training.checkpoints import (
     CheckpointError,
@@ -262,6 +263,7 @@ def _load(dataset: Dataset, split: str, config: TrainConfig, folder: Path) -> Ex
         policy=config.policy,
         ambiguous=config.ambiguous,
         predicates=config.predicates,
+        families=config.families,
         cache_bytes=config.cache_bytes,
         folder=folder,
     )
@@ -284,15 +286,16 @@ def measure(model: RelevanceModel, examples: Examples, batch: int = 16) -> dict[
     """Metrics per predicate on all goals of the examples, at beta = 0; see `accuracy`.
 
     `queries` leaves subject and reference out, `with_goal_objects` has them; `whole_goals` is
-    the share of goals with every query right. `same-plane` pools its four predicates.
+    the share of goals with every query right. `same-plane` pools its four predicates; what a
+    predicate is asked in another family than its own stands under that family.
     """
     model.eval()
     pooled: dict[str, list[tuple[np.ndarray, ...]]] = {}
     with torch.inference_mode():
-        for predicate in examples.goals:
+        for predicate, family in product(examples.goals, sorted(set(examples.families), key=str)):
             if predicate.name not in model.predicates:
                 continue
-            scenes = examples.scenes([predicate])
+            scenes = examples.scenes([predicate], family)
             for start in range(0, len(scenes), batch):
                 drawn = gather(examples, scenes[start : start + batch], [predicate])
                 drawn = drawn.to(model.device)
@@ -303,7 +306,7 @@ def measure(model: RelevanceModel, examples: Examples, batch: int = 16) -> dict[
                 asked = places[:, None] != goals[..., None, :]
                 arrays = (score, relevant, labelled, asked.all(-1))
                 rows = tuple(array.flatten(0, 1).cpu().numpy() for array in arrays)
-                for name in {predicate.name, predicate.family}:
+                for name in {group_of(predicate.name, family), family or predicate.family}:
                     pooled.setdefault(name, []).append(rows)
     return {name: _metrics(parts) for name, parts in sorted(pooled.items())}
 
