@@ -25,8 +25,11 @@ def known():
     }
 
 todo = tasks(24, 5)
-compiling.compile_others()
-assert keyframes.solve.overloads and pose.find_pose.overloads and not path.motion.overloads
+compiling.other_half()
+assert keyframes.solve.overloads and path.retreat.overloads
+assert not pose.find_pose.overloads and not path.motion.overloads
+compiling.first_half()
+assert pose.find_pose.overloads and path.motion.overloads
 warm_up()
 before = known()
 assert before["relevance.planner.path.motion"] == 1
@@ -58,7 +61,7 @@ def unused(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
     monkeypatch.setattr(compiling, "functions", lambda: None)
     monkeypatch.setattr(compiling, "_child", lambda: done.append("others"))
-    monkeypatch.setattr(compiling, "compile_motions", lambda: done.append("motions"))
+    monkeypatch.setattr(compiling, "first_half", lambda: done.append("motions"))
     monkeypatch.setattr(compiling.os, "sched_getaffinity", lambda _: {0, 1})
     return done
 
@@ -93,7 +96,7 @@ def test_who_comes_meanwhile_waits_for_the_first(unused, monkeypatch):
     def rest():
         unused.append("rest")
 
-    monkeypatch.setattr(compiling, "compile_motions", motions)
+    monkeypatch.setattr(compiling, "first_half", motions)
     threads = [threading.Thread(target=compiling.compile_once, args=(rest,)) for _ in range(2)]
     threads[0].start()
     assert started.wait(60)

@@ -18,7 +18,7 @@ from relevance.scene import Robot, Scene
 HAND, FINGERS = 8, (9, 10)
 BURDENED = Scene(
     objects=(
-        box("red", 0.0, 0.25),
+        box("red", 0.2, -0.05),
         box("blue", 0.0, -0.15),
         box("grey", 0.0, -0.15, bottom=0.06, on="blue"),
     ),

@@ -1,8 +1,8 @@
 """First use: the kernels are compiled by two processes at once, and by one caller at a time.
 
-The motions of the path bound are half of the work and are compiled here; the rest is compiled by
-a child. What both need, each finds in the cache when the other was first, so they begin at
-different ends: the child with the retreat, whose kernels the motions need last.
+One half is compiled here, the other by a child. What both need, each finds in the cache when the
+other was first, so they begin at different ends: the child with the retreat, whose kernels the
+motions need last.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from relevance.planner.grasps import bodies, grasps, pick_target
 from relevance.planner.kernels.kinematics import functions
 from relevance.planner.keyframes import KeyframeBound
 from relevance.planner.path import ROWS, VERTICAL, motion, retreat
-from relevance.planner.pose import PoseBound
+from relevance.planner.pose import Placement, PoseBound
 from relevance.planner.problem import Problem
 from relevance.robot import HOME
 from relevance.scene import Box, Scene
@@ -52,7 +52,7 @@ def compile_once(rest: Callable[[], None]) -> None:
             )  # fmt: skip
             functions()  # C, built once for both
             child = _child() if len(os.sched_getaffinity(0)) > 1 else None
-            compile_motions()
+            first_half()
             if child is not None:
                 child.wait()
         rest()
@@ -60,24 +60,24 @@ def compile_once(rest: Callable[[], None]) -> None:
             done.touch()
 
 
-def compile_motions() -> None:
-    """Compile the path bound's motions."""
+def first_half() -> None:
+    """Compile the motions of the path bound, then the pose bound."""
     problem = _problem()
     grasp = grasps(problem.subject)[0]
     target, hand = pick_target(problem.subject, grasp), bodies(grasp.opening)
     rows = np.tile(HOME, (ROWS + 1, 1))
     motion(rows, problem.arm, np.zeros(4), False, target, hand, problem.obstacles)
+    next(PoseBound(problem).place_all((problem.goal.subject,)), None)
 
 
-def compile_others() -> None:
-    """Compile the pose and keyframe bounds, and what the path bound needs besides motions."""
+def other_half() -> None:
+    """Compile the retreat of the path bound, then the keyframe bound."""
     problem = _problem()
+    grasp, place = grasps(problem.subject)[0], problem.reference.position
     rows = np.tile(HOME, (2 * VERTICAL + 1, 1))
-    retreat(rows, problem.arm, np.zeros(4), bodies(0.02), problem.obstacles)
-    pose = PoseBound(problem)
-    order = (problem.goal.subject,)
-    for placements in pose.place_all(order):
-        KeyframeBound(pose).solve(order, placements)
+    retreat(rows, problem.arm, np.zeros(4), bodies(grasp.opening), problem.obstacles)
+    there = Placement(grasp=grasp, pose=(*place[:2], 0.0))
+    KeyframeBound(PoseBound(problem)).solve((problem.goal.subject,), [there])
 
 
 def _problem() -> Problem:
@@ -120,7 +120,7 @@ def _child() -> subprocess.Popen[bytes] | None:
     path = os.pathsep.join(entry for entry in sys.path if entry)
     with suppress(OSError):
         return subprocess.Popen(
-            [sys.executable, "-P", "-c", f"import {__name__} as the; the.compile_others()"],
+            [sys.executable, "-P", "-c", f"import {__name__} as the; the.other_half()"],
             env={**os.environ, "PYTHONPATH": path},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,

@@ -146,20 +146,20 @@ def warm_up() -> None:
 
 
 def _one_of_each() -> None:
-    """Plans that need every kernel: one box in the way, and a tall one beside the arm."""
-    size, beside = (0.05, 0.05, 0.05), {"bar": ((0.2, 0.04, 0.3), (0.1, -0.3, 0.15))}
-    places = {"a": (0.0, 0.2, 0.025), "b": (0.0, 0.0, 0.025), "c": (0.0, 0.0, 0.075)}
-    boxes = {name: (size, place) for name, place in places.items()} | beside
+    """Plans that need every kernel: a box in the way, one that its neighbours let the hand take
+    by its top alone, and a tall one."""
+    grey, cube = (0.5, 0.5, 0.5), (0.05, 0.05, 0.05)
     scene = Scene(
-        objects=tuple(
-            Box(
-                name=name, size=size, position=at, color=(0.5, 0.5, 0.5),
-                on="b" if name == "c" else None,
-            )
-            for name, (size, at) in boxes.items()
+        objects=(
+            Box(name="a", size=(0.05, 0.05, 0.06), position=(0.0, 0.2, 0.03), color=grey),
+            Box(name="d", size=(0.05, 0.05, 0.04), position=(0.055, 0.2, 0.02), color=grey),
+            Box(name="e", size=(0.05, 0.05, 0.04), position=(0.0, 0.255, 0.02), color=grey),
+            Box(name="b", size=cube, position=(0.0, 0.0, 0.025), color=grey),
+            Box(name="c", size=cube, position=(0.0, 0.0, 0.075), color=grey, on="b"),
+            Box(name="f", size=(0.2, 0.04, 0.3), position=(0.1, -0.3, 0.15), color=grey),
         )
-    )  # fmt: skip
-    for goal in ("on(a, b)", "on-the-left(b, a)", "in-front(bar, a)"):
+    )
+    for goal in ("on(a, b)", "on-the-left(b, a)", "in-front(f, a)"):
         _plan(scene, scene.goal(goal), PlannerConfig(), None, None)
 
 
