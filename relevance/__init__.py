@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from relevance.errors import RelevanceError, RelevanceWarning
     from relevance.evaluation import load_guide
-    from relevance.planner import Guide, PlannerConfig, PlanResult, plan
+    from relevance.planner import Guide, PlannerConfig, PlanResult, plan, trajectory
     from relevance.scene import Goal, Scene, SceneError, read_scenes
     from relevance.store import Dataset
 
@@ -78,6 +78,7 @@ _HOMES = {
     "load_guide": "relevance.evaluation",
     "plan": "relevance.planner",
     "read_scenes": "relevance.scene",
+    "trajectory": "relevance.planner",
 }
 
 __all__ = [
@@ -93,6 +94,7 @@ __all__ = [
     "load_guide",
     "plan",
     "read_scenes",
+    "trajectory",
 ]
 
 

@@ -119,6 +119,8 @@ def test_the_other_defaults_come_from_the_preset(capsys: pytest.CaptureFixture[s
         (["generate", "new", "--replay-share", "2"], "DatasetConfig.replay_share = 2.0: expected"),
         (["plan", "none.jsonl"], "none.jsonl: cannot be read"),
         (["plan", "none.jsonl", "--limit", "0"], "--limit 0: expected at least 1"),
+        (["plan", "none.jsonl", "--trajectory", "a.npy"], "a.npy: expected a file that ends in"),
+        (["plan", "none.jsonl", "--trajectory", "no/a.npz"], "no is no folder that can be"),
         (["plan", "none.jsonl", "--guide", "prune"], "--guide and --checkpoint go together"),
         (["paln"], "unknown command 'paln', expected one of estimate, generate, label"),
     ],
@@ -160,8 +162,8 @@ def test_plan_prints_one_json_line_a_goal(tmp_path: Path) -> None:
     for line in lines:
         assert set(line) == {
             *("id", "goal", "status", "reason", "actions", "moved", "final"),
-            *("cost", "ambiguous", "seconds", "counts", "replay"),
-        } | (set(line) & {"blocking"})
+            *("blocking", "cost", "ambiguous", "seconds", "counts", "replay"),
+        }
         assert set(line["counts"]) == {"nodes", "pose", "keyframe", "path"}
         assert (line["id"], line["status"]) == ("s1", "solved")
         assert line["replay"]["ok"]

@@ -3,6 +3,7 @@
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import dataclasses
 import math
+import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -34,6 +35,7 @@ def _plan(_: Preset) -> Callable[..., int]:
         limit: int = default.node_limit,
         max_actions: int = default.max_actions,
         seconds: float = 30.0,
+        trajectory: OptionalPath = None,
     ) -> int:
         """Plan the goals of your own scenes; every plan is replayed in the simulator.
 
@@ -54,6 +56,9 @@ def _plan(_: Preset) -> Callable[..., int]:
             max_actions: Most picks and places in a plan.
             seconds: CPU seconds that rai has for a goal (--search, --limit and --max-actions
                 are settings of our planner).
+            trajectory: File (.npz) for the plan as arrays: times, joints, gripper, attached (see
+                relevance.trajectory). With several goals they are numbered in order: plan.npz
+                becomes plan-1.npz, plan-2.npz. A goal without a plan leaves no file.
         """
         one_of("--planner", planner, PLANNERS)
         one_of("--guide", guide, GUIDES)
@@ -61,6 +66,7 @@ def _plan(_: Preset) -> Callable[..., int]:
         at_least("--max-actions", max_actions, 2)
         at_least("--seconds", seconds, 0.001)
         at_least("--beta", beta, -math.inf)
+        _check_trajectory(trajectory)
         if GUIDES[guide].guided != (checkpoint is not None):
             raise UsageError("--guide and --checkpoint go together: a guide needs a model")
         chosen = PLANNERS[planner]
@@ -81,6 +87,7 @@ def _plan(_: Preset) -> Callable[..., int]:
         ]
         if not tasks:
             raise SceneError(f"{scenes}: no goals, expected some in the file or by --goal")
+        files = _numbered(trajectory, len(tasks))
         guidance: Any = None
         if checkpoint:
             from relevance.evaluation import load_guide
@@ -97,6 +104,9 @@ def _plan(_: Preset) -> Callable[..., int]:
                 result = chosen.plan(scene, wanted, config=config, guide=guidance, replay=True)
                 refused += result.status == "refused"
                 line = plan_line(scene.id, result)
+                file = files[done - 1]
+                if file is not None:
+                    line["trajectory"] = str(file) if _write(file, result) else None
                 print(to_json(line) if json else plan_text(line), flush=True)
                 progress(done, len(tasks))
         return 1 if refused else 0
@@ -108,11 +118,12 @@ def plan_line(scene_id: str, result: Any) -> dict[str, Any]:
     """A result as `plan --json` prints it."""
     counts = {name: getattr(result.counts, name) for name in ("nodes", "pose", "keyframe", "path")}
     verdict = result.replay
-    line = {
+    return {
         "id": scene_id,
         "goal": str(result.goal),
         "status": result.status,
         "reason": result.reason,
+        "blocking": list(result.blocking),
         "actions": [action.to_list() for action in result.actions],
         "moved": list(result.moved),
         "final": {
@@ -130,9 +141,36 @@ def plan_line(scene_id: str, result: Any) -> dict[str, Any]:
             "max_penetration": verdict.max_penetration,
         },
     }
-    if hasattr(result, "blocking"):
-        line["blocking"] = result.blocking
-    return line
+
+
+def _check_trajectory(file: Path | None) -> None:
+    """UsageError where no such file can be written."""
+    if file is None:
+        return
+    if file.suffix != ".npz":
+        raise UsageError(f"--trajectory {file}: expected a file that ends in .npz")
+    if not file.parent.is_dir() or not os.access(file.parent, os.W_OK):
+        raise UsageError(f"--trajectory {file}: {file.parent} is no folder that can be written")
+    if file.is_dir():
+        raise UsageError(f"--trajectory {file}: is a folder, expected a file")
+
+
+def _numbered(file: Path | None, count: int) -> list[Path | None]:
+    """A file for each plan."""
+    if file is None or count == 1:
+        return [file] * count
+    return [file.with_stem(f"{file.stem}-{number}") for number in range(1, count + 1)]
+
+
+def _write(file: Path, result: Any) -> bool:
+    """Write a plan's arrays, whole or not at all; a file of an older plan goes in any case."""
+    from relevance.planner import write_trajectory
+
+    if result.status != "solved":
+        file.unlink(missing_ok=True)
+        return False
+    write_trajectory(file, result)
+    return True
 
 
 def plan_text(line: Mapping[str, Any]) -> str:
@@ -145,9 +183,9 @@ def plan_text(line: Mapping[str, Any]) -> str:
         replayed = ["replayed"] if line["replay"] else []
         head += ", ".join([f"solved in {line['seconds']:.3f} s", *replayed, *notes])
     else:
-        blocking = [f"blocked by {line['blocking']}"] if line.get("blocking") else []
-        found = [f"{line['status']} ({line['reason']})", *blocking]
-        head += ", ".join([*found, f"{line['counts']['nodes']} nodes", *notes])
+        count = line["counts"]["nodes"]
+        nodes = f"{count} node{'' if count == 1 else 's'} opened"
+        head += ", ".join([f"{line['status']} ({line['reason']})", nodes, *notes])
     steps = [f"  {i}. {' '.join(action)}" for i, action in enumerate(line["actions"], 1)]
     return "\n".join([head, *steps])
 
@@ -161,6 +199,7 @@ COMMANDS = {
             "relevance plan scene.json --goal 'on(red, blue)' --search tree",
             "relevance plan scenes.jsonl --guide prune-then-full --checkpoint model.pt",
             "relevance plan scenes.jsonl --planner rai --seconds 10",
+            "relevance plan scenes.jsonl --trajectory plan.npz",
             "relevance plan - < scenes.jsonl",
         ),
     ),

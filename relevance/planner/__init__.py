@@ -14,7 +14,7 @@ from relevance.planner.result import (
     Status,
 )
 from relevance.planner.search import Ours, plan, warm_up
-from relevance.planner.trajectories import trajectory
+from relevance.planner.trajectories import trajectory, write_trajectory
 
 for _planner in (Ours(), Rai()):
     PLANNERS.register(_planner.name, _planner)
@@ -38,4 +38,5 @@ __all__ = [
     "plan",
     "trajectory",
     "warm_up",
+    "write_trajectory",
 ]

@@ -33,6 +33,7 @@ from relevance.planner.kernels.kinematics import (
     look_at_frames,
     look_at_grasp,
 )
+from relevance.planner.kernels.rows import assign
 from relevance.planner.pose import Placement, PoseBound, moved_box
 from relevance.robot import ARM, HOME, panda
 from relevance.scene.geometry import UPRIGHT, upright
@@ -175,16 +176,20 @@ def _start(arm: Arm, targets: tuple[np.ndarray, ...], q: np.ndarray, *, shifted:
 
 
 @njit(cache=True)
-def _push(H, g, index, row, count, value, multiplier, mu, equality):
-    """Add one constraint row to the augmented Lagrangian; returns (merit, violation)."""
+def _push(H, g, index, row, count, value, multiplier, mu, lowest):
+    """Add one constraint row to the augmented Lagrangian; returns (merit, violation).
+
+    lowest: 0 for an inequality, -inf for an equality. Callers say int64 of their counts and give
+    no bool: each literal would be compiled once more.
+    """
     shifted = value + multiplier / mu
-    if not equality and shifted <= 0:
+    if shifted <= lowest:
         return 0.0, max(value, 0.0)
     for a in range(count):
         g[index[a]] += mu * shifted * row[a]
         for b in range(a + 1):  # indices ascend: the lower triangle
             H[index[a], index[b]] += mu * row[a] * row[b]
-    return 0.5 * mu * shifted * shifted, abs(value) if equality else max(value, 0.0)
+    return 0.5 * mu * shifted * shifted, abs(value) if lowest < 0 else max(value, 0.0)
 
 
 @njit(cache=True)
@@ -230,14 +235,14 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
             target[0], target[1] = x[at] - shift * s, x[at + 1] + shift * c
             target[2], target[3] = switches.place_z[j], x[at + 2]
         else:
-            target[:] = switches.pick[j]
+            assign(target, switches.pick[j])
         q = x[k * ARM : (k + 1) * ARM]
         look_at_grasp(arm, q, target)
         look_at_frames(arm, q)
         for r in range(6):
             for i in range(ARM):
                 index[i], row[i] = k * ARM + i, arm.grasp_y[6 + r * ARM + i]
-            count = ARM
+            count = np.int64(ARM)
             if placing:
                 for i in range(3):
                     index[count] = at + i
@@ -248,7 +253,7 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                     count += 1
             value = arm.grasp_y[r]
             eq[k, r] += gain * value
-            got, violated = _push(H, g, index, row, count, value, eq[k, r], mu, True)
+            got, violated = _push(H, g, index, row, count, value, eq[k, r], mu, -np.inf)
             merit += got
             worst = max(worst, violated)
         for i in range(ARM):
@@ -256,7 +261,9 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                 value = arm.lower[i] - q[i] if side == 0 else q[i] - arm.upper[i]
                 index[0], row[0] = k * ARM + i, (-1.0 if side == 0 else 1.0)
                 limit[k, i, side] = max(0.0, limit[k, i, side] + gain * value)
-                got, violated = _push(H, g, index, row, 1, value, limit[k, i, side], mu, False)
+                got, violated = _push(
+                    H, g, index, row, np.int64(1), value, limit[k, i, side], mu, 0.0
+                )
                 merit += got
                 worst = max(worst, violated)
         for b in range(switches.n_bodies[k]):
@@ -267,7 +274,7 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                 held = b == switches.n_bodies[k] - 1
                 if not switches.stands[k, w]:
                     continue
-                o[:] = obstacles[w]
+                assign(o, obstacles[w])
                 if placing and held:  # what is not above its support is not in its way
                     under = switches.turn[j, 1] - switches.half[k, b, 2]
                     if w == switches.support[j] or o[2] + o[6] <= under + 1e-6:
@@ -289,7 +296,7 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                 point_gradient(frame, contact, normal, part)
                 for i in range(ARM):
                     index[i], row[i] = k * ARM + i, -part[i]
-                count = ARM
+                count = np.int64(ARM)
                 if free:
                     there = first + 3 * other
                     spin = normal[1] * (contact[0] - o[0]) - normal[0] * (contact[1] - o[1])
@@ -297,7 +304,7 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                         index[count] = there + i
                         row[count] = spin if i == 2 else normal[i]
                         count += 1
-                got, violated = _push(H, g, index, row, count, value, ineq[k, b, w], mu, False)
+                got, violated = _push(H, g, index, row, count, value, ineq[k, b, w], mu, 0.0)
                 merit += got
                 worst = max(worst, violated)
     for j in range(m):
@@ -326,7 +333,7 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                 value = sign * (distance - switches.bounds[j, 3 if side == 8 else 2])
             index[0], index[1] = at, at + 1
             edge[j, side] = max(0.0, edge[j, side] + gain * value)
-            got, violated = _push(H, g, index, row, 2, value, edge[j, side], mu, False)
+            got, violated = _push(H, g, index, row, np.int64(2), value, edge[j, side], mu, 0.0)
             merit += got
             worst = max(worst, violated)
     for i in range(n):
@@ -358,7 +365,7 @@ def solve(x, arm, switches, p0, weight):
                 longest = max(longest, abs(step[i]))
                 slope += step[i] * g[i]
             scale = min(1.0, 0.5 / max(longest, 1e-12))
-            old[:] = x
+            assign(old, x)
             new = merit
             for _ in range(8):
                 for i in range(n):

@@ -32,7 +32,13 @@ from relevance.planner.kernels.kinematics import (
     look_at_frames,
     look_at_grasp,
 )
-from relevance.planner.kernels.rows import WIDTH, acceleration_cost, smoothness, time_step
+from relevance.planner.kernels.rows import (
+    WIDTH,
+    acceleration_cost,
+    assign,
+    smoothness,
+    time_step,
+)
 from relevance.planner.logic import actions
 from relevance.planner.pose import Placement
 from relevance.planner.problem import Problem
@@ -245,7 +251,8 @@ def assemble(
     """
     T = len(X) - 1
     merit, worst = 0.0, 0.0
-    band[:, :] = smooth
+    for i in range(len(band)):
+        assign(band[i], smooth[i])
     g[:] = 0.0
     for t in range(T + 1):
         for i in range(ARM):
@@ -353,7 +360,8 @@ def solve(X, arm, bodies, obstacles, margin, samples, targets):
                 longest = max(longest, abs(step[i]))
                 slope += step[i] * g[i]
             scale = min(1.0, 0.5 / max(longest, 1e-12))
-            old[:] = X
+            for t in range(T + 1):
+                assign(old[t], X[t])
             new = merit
             for _ in range(6):
                 for t in range(1, T):
@@ -540,14 +548,14 @@ def _column(X, arm, q, switch, row, direction, safe, targets):
         targets[row, 4] = 1.0
         if not reach_to(arm, q, targets[row]):
             return False
-        X[row] = q
+        assign(X[row], q)
         row += direction
     target = switch.copy()
     for k in range(4):
         top = q.copy()
         target[2] = switch[2] + RISE + (1.0 - 0.25 * k) * max(0.0, safe - switch[2] - RISE)
         if reach_to(arm, top, target) and _within_limits(arm, top):
-            q[:] = top
+            assign(q, top)
             break
     return True
 
@@ -564,7 +572,7 @@ def retreat(X, arm, leave, bodies, obstacles) -> tuple[float, float, float]:
     for t in range(1, steps + 1):
         share = t / steps
         target[2] = leave[2] + RISE * share * share * (3 - 2 * share)
-        X[t] = X[t - 1]
+        assign(X[t], X[t - 1])
         if not reach_to(arm, X[t], target) or not _within_limits(arm, X[t]):
             return -1.0, 0.0, 0.0
     margin = np.zeros((len(bodies.link), len(obstacles)))

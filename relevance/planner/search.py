@@ -22,6 +22,7 @@ from itertools import islice
 
 from relevance.planner import logic
 from relevance.planner.checking import broken
+from relevance.planner.compiling import compile_once
 from relevance.planner.grasps import fits, grasps
 from relevance.planner.guides import Guide, ask, rounds
 from relevance.planner.keyframes import KeyframeBound
@@ -67,6 +68,7 @@ def plan(
     its seconds. Raises SceneError for an unknown predicate or object. A goal that cannot be
     reached is a result with a reason.
     """
+    warm_up()
     found = _plan(scene, scene.goal(goal), config or PlannerConfig(), guide, movable)
     return replayed(scene, found) if replay else found
 
@@ -139,13 +141,26 @@ class Ours:
 
 @cache
 def warm_up() -> None:
-    """Compile the solvers now (once a process), so that no plan's time includes it."""
-    color = (0.5, 0.5, 0.5)
-    boxes = [
-        Box(name=name, size=(0.05, 0.05, 0.05), position=(0.0, y, 0.025), color=color)
-        for name, y in (("a", 0.2), ("b", 0.0))
-    ]
-    plan(Scene(objects=tuple(boxes)), "on(a, b)", replay=False)
+    """Compile or load the solvers, once a process, so that no plan's time includes it."""
+    compile_once(_one_of_each)
+
+
+def _one_of_each() -> None:
+    """Plans that need every kernel: a box in the way, one that its neighbours let the hand take
+    by its top alone, and a tall one."""
+    grey, cube = (0.5, 0.5, 0.5), (0.05, 0.05, 0.05)
+    scene = Scene(
+        objects=(
+            Box(name="a", size=(0.05, 0.05, 0.06), position=(0.0, 0.2, 0.03), color=grey),
+            Box(name="d", size=(0.05, 0.05, 0.04), position=(0.055, 0.2, 0.02), color=grey),
+            Box(name="e", size=(0.05, 0.05, 0.04), position=(0.0, 0.255, 0.02), color=grey),
+            Box(name="b", size=cube, position=(0.0, 0.0, 0.025), color=grey),
+            Box(name="c", size=cube, position=(0.0, 0.0, 0.075), color=grey, on="b"),
+            Box(name="f", size=(0.2, 0.04, 0.3), position=(0.1, -0.3, 0.15), color=grey),
+        )
+    )
+    for goal in ("on(a, b)", "on-the-left(b, a)", "in-front(f, a)"):
+        _plan(scene, scene.goal(goal), PlannerConfig(), None, None)
 
 
 class _Bounds:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
+from pathlib import Path
+
 import numpy as np
 
 from relevance.planner.result import PlanResult
@@ -14,9 +18,10 @@ GRIP_SECONDS = 0.5
 def trajectory(result: PlanResult) -> dict[str, np.ndarray]:
     """A plan's motion, as `numpy.savez` takes it; T = 0 where nothing moves.
 
-    times (T,): s, ascending. joints (T, 7): rad, linear between rows. gripper (T,): the value of
-    each of the two finger joints, m; the arm stands still while it changes. attached (T,): name
-    of the box in the hand from this row on, empty if none.
+    times (T,): s, ascending from 0. joints (T, 7): rad, linear between rows. gripper (T,): the
+    value of each of the two finger joints, half the width between the pads, m; the arm stands
+    still while it changes. attached (T,): name of the box in the hand from this row on, rigid to
+    it, empty if none. Whatever the plan's status is, these are its motions.
     """
     times, joints, gripper, attached = [], [], [], []
     now, phases = 0.0, result.phases
@@ -41,3 +46,16 @@ def trajectory(result: PlanResult) -> dict[str, np.ndarray]:
         "gripper": np.concatenate(gripper),
         "attached": np.concatenate(attached).astype(str),
     }
+
+
+def write_trajectory(file: Path, result: PlanResult) -> None:
+    """Write a plan's arrays as .npz: the whole file or, where that fails, what was there before."""
+    handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}-")
+    half = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            np.savez(stream, **trajectory(result))  # pyright: ignore[reportArgumentType]
+        half.chmod(0o644)
+        half.replace(file)
+    finally:
+        half.unlink(missing_ok=True)

@@ -208,6 +208,6 @@ def _reach_interval(height, lower, upper):
     target[2] = height
     for i in range(350):
         target[0] = 0.15 + 0.002 * i
-        if hand_down(target, base, lower, upper, q):
+        if hand_down(target, base, lower, upper, q, 0.0):
             near, far = min(near, target[0]), max(far, target[0])
     return near, far

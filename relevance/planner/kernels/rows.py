@@ -16,6 +16,16 @@ WIDTH = 3 * ARM
 
 
 @njit(cache=True)
+def assign(to, source):
+    """Copy one row (n,) into another.
+
+    `to[:] = source` would bring in numba's strings, for an error that cannot be: 4 s to compile.
+    """
+    for i in range(len(to)):
+        to[i] = source[i]
+
+
+@njit(cache=True)
 def smoothness(T):
     """Second derivative of half the squared accelerations, (n, 3 * ARM) as for `banded_solve`."""
     band = np.zeros(((T - 1) * ARM, WIDTH))
