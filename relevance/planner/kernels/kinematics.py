@@ -186,7 +186,7 @@ def hand_down(target, base, lower, upper, q, way=0.0):
     if way == 0.0:
         q[6] = math.pi / 4 + turn - math.pi * math.floor(turn / math.pi + 0.5)
     else:  # the limits are not far from half a turn to both sides
-        q[6] = math.pi / 4 + turn + (0.0 if way > 0 else math.pi)
+        q[6] = math.pi / 4 + turn + (math.pi if way > 0 else 0.0)
         q[6] -= 2 * math.pi * math.floor(q[6] / (2 * math.pi) + 0.5)
     return (q >= lower).all() and (q <= upper).all()
 
