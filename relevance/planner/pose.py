@@ -65,6 +65,7 @@ class PoseBound:
         self._blockers: dict[str, dict[Grasp, frozenset[str]]] = {}
         self._more: dict[str, dict[Grasp, frozenset[str]]] = {}
         self._goal_poses: dict[tuple, Placement | None] = {}
+        self._held: dict[tuple[tuple[Grasp, ...], float], tuple] = {}
         self._intervals: dict[float, tuple[float, float]] = {}
 
     def blockers(self, name: str) -> dict[Grasp, frozenset[str]]:
@@ -222,23 +223,13 @@ class PoseBound:
         """
         began, problem = time.process_time(), self.problem
         problem.counts.pose += 1
-        shallow = list({grasp.shift: grasp for grasp in choice}.values())
-        # Shifted to one side, or to the other and turned: the hand is at the same place.
-        sides = {
-            -grasp.shift if turn else grasp.shift: (grasp, turn)
-            for turn in (1, 0)
-            for grasp in shallow
-        }
-        ways = sorted(sides.values(), key=lambda way: way[0].price)
-        pose, prefer = np.zeros(4), np.array(prefer)
+        key = (choice, bottom)
+        if key not in self._held:
+            ways = _ways(choice)
+            self._held[key] = ways, *self._held_so(ways, box, bottom)
+        ways, parts, near, far = self._held[key]
+        pose, prefer = np.zeros(4), np.asarray(prefer)
         table, at = problem.table, problem.arm.base
-
-        def bounds(held: list[tuple[Grasp, int]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            parts = np.array([_turned(one.parts) if turn else one.parts for one, turn in held])
-            reach = np.array([self.interval(bottom, box, grasp) for grasp, _ in held]).T
-            return parts, np.ascontiguousarray(reach[0]), np.ascontiguousarray(reach[1])
-
-        parts, near, far = bounds(ways)
 
         def find(ease: float) -> tuple[int, float]:
             return find_pose(
@@ -248,11 +239,11 @@ class PoseBound:
         status, spare = find(0.0)
         found = None
         if status == FOUND:
-            x, y, angle = (float(value) for value in pose[:3])
-            grasp, turn = ways[int(pose[3])]
+            x, y, angle, way = pose.tolist()
+            grasp, turn = ways[int(way)]
             for deeper in choice:
                 if deeper.shift == grasp.shift and deeper.depth > grasp.depth:
-                    held = bounds([(deeper, turn)])
+                    held = self._held_so([(deeper, turn)], box, bottom)
                     there = (x, y, angle, bottom, held[0], obstacles, table, at, *held[1:])
                     value, _ = slack(*there, 0.0)
                     if value >= 0:
@@ -268,6 +259,15 @@ class PoseBound:
         problem.undecided |= close
         problem.seconds.pose += time.process_time() - began
         return found
+
+    def _held_so(
+        self, ways: list[tuple[Grasp, int]], box: Box, bottom: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Parts and reach (near, far) of the ways in which a box can be put down, as `slack` has
+        them."""
+        parts = np.array([_turned(one.parts) if turn else one.parts for one, turn in ways])
+        near, far = zip(*(self.interval(bottom, box, one) for one, _ in ways), strict=True)
+        return parts, np.array(near), np.array(far)
 
     def _references(self, order: tuple[str, ...]) -> Iterator[Box]:
         """The reference where it stands, or where it might be put if the order moves it."""
@@ -337,6 +337,18 @@ class PoseBound:
             pose = (*box.position[:2], angle)
             found.append(volumes(grasp.parts, pose, box.bottom, 0.0, SKY)[1:])
         return found
+
+
+def _ways(choice: tuple[Grasp, ...]) -> list[tuple[Grasp, int]]:
+    """The shallowest grasp of each shift, and whether the hand is turned by half a turn.
+
+    Shifted to one side, or to the other and turned: the hand is at the same place.
+    """
+    shallow = {grasp.shift: grasp for grasp in choice}.values()
+    sides = {
+        -grasp.shift if turn else grasp.shift: (grasp, turn) for turn in (1, 0) for grasp in shallow
+    }
+    return sorted(sides.values(), key=lambda way: way[0].price)
 
 
 def moved_box(box: Box, place: Placement) -> Box:

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
+from numba import njit
 
 from relevance.planner import logic
 from relevance.planner.kernels.kinematics import Arm, arm_at
@@ -51,14 +53,13 @@ class Problem:
     tall: bool = field(init=False)
     """Whether a box is so high that it could meet the links near the base."""
     arm: Arm = field(init=False)
-    whole_arm: Arm = field(init=False)
-    """The same with the links near the base."""
+    _regions: dict[tuple, np.ndarray] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.boxes = {box.name: box for box in self.scene.objects}
         self.index = {name: i for i, name in enumerate(self.boxes)}
         base = np.array([*self.scene.robot.base, self.scene.robot.yaw])
-        self.arm, self.whole_arm = arm_at(base), arm_at(base, upper=True)
+        self.arm = arm_at(base)
         self.table = np.array(self.scene.table.size) / 2
         standing = [obstacle(box) for box in self.scene.objects]
         self._unsink(np.array(standing), standing)
@@ -66,6 +67,11 @@ class Problem:
         tops = [box.top for box in self.scene.objects]
         self.tall = max(tops) - self.scene.robot.base[2] > LOW
         self.above = logic.stacked_on(self.scene)
+
+    @cached_property
+    def whole_arm(self) -> Arm:
+        """The arm with the links near the base."""
+        return arm_at(self.arm.base, upper=True)
 
     @property
     def subject(self) -> Box:
@@ -80,11 +86,7 @@ class Problem:
     def _unsink(self, rows: np.ndarray, standing: list[np.ndarray]) -> None:
         """Shrink boxes that are sunk into others (a scene may have that, up to a millimetre), so
         that they only touch."""
-        apart = np.hypot(*(rows[:, None, :2] - rows[None, :, :2]).transpose(2, 0, 1))
-        beside = apart < rows[:, None, 7] + rows[None, :, 7]
-        heights = rows[:, None, 6] + rows[None, :, 6] - 1e-3  # what stands on another is not beside
-        beside &= np.abs(rows[:, None, 2] - rows[None, :, 2]) < heights
-        for i, k in zip(*np.nonzero(np.triu(beside, 1)), strict=True):
+        for i, k in _neighbours(rows):
             sunk = -footprint_gap(self.scene.objects[i], self.scene.objects[k])
             for row in (standing[i], standing[k]) if sunk > 0 else ():
                 x, y, z, yaw, hx, hy, hz = row[:7]
@@ -107,9 +109,26 @@ class Problem:
 
     def goal_region(self, reference: Box) -> np.ndarray:
         """Rectangle for the subject's centre: x, y, angle, half extents (5,)."""
-        there = self.goal.predicate.region(self.subject, reference, self.scene.robot)
-        half = [max(extent - REGION_MARGIN, 0.0) for extent in there.half]
-        return np.array([there.x, there.y, there.angle, *half])
+        place = (reference.position, reference.yaw)
+        if place not in self._regions:
+            there = self.goal.predicate.region(self.subject, reference, self.scene.robot)
+            half = [max(extent - REGION_MARGIN, 0.0) for extent in there.half]
+            self._regions[place] = np.array([there.x, there.y, there.angle, *half])
+        return self._regions[place]
+
+
+@njit(cache=True)
+def _neighbours(rows):
+    """The pairs of boxes (N, UPRIGHT) whose footprints could overlap at the same height."""
+    found = []
+    for i in range(len(rows)):
+        for k in range(i + 1, len(rows)):
+            a, b = rows[i], rows[k]
+            apart = math.hypot(a[0] - b[0], a[1] - b[1])
+            # what stands on another is not beside it
+            if apart < a[7] + b[7] and abs(a[2] - b[2]) < a[6] + b[6] - 1e-3:
+                found.append((i, k))
+    return found
 
 
 def obstacle(box: Box) -> np.ndarray:
