@@ -346,7 +346,8 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
         region = np.array([0.0, 0.0, 0.2, 0.05, 0.03])
         near, far = reach_interval(0.15)
         at = np.zeros(4)
-        common = (0.0, grasp.parts[None], obstacles, table, BASE, np.array([near]), np.array([far]))
+        reach = np.array([[near, far, 0.0, pose.ANY_TURN]])
+        common = (0.0, grasp.parts[None], obstacles, table, BASE, reach)
         status, _ = pose.find_pose(region, np.zeros(2), *common, 0.0, at)
         c, s = math.cos(0.2), math.sin(0.2)
         grid = max(

@@ -191,6 +191,12 @@ def hand_down(target, base, lower, upper, q, way=0.0):
     return (q >= lower).all() and (q <= upper).all()
 
 
+def facing(way: float) -> float:
+    """The finger angle against the hand's bearing from the base at which the last joint of the
+    planar solution is in its middle, rad; way as in `hand_down`."""
+    return 0.75 * math.pi + (math.pi if way > 0 else 0.0)
+
+
 @cache
 def reach_interval(height: float) -> tuple[float, float]:
     """Distances (near, far) from the base's axis that the downward hand reaches, m.
