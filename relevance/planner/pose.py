@@ -128,14 +128,15 @@ class PoseBound:
         subject = problem.subject
         standing: np.ndarray | None = None
         taken = frozenset(problem.boxes) if everywhere else gone
-        for choice in self.choices(subject.name, taken):
-            key = (gone, choice, reference.position, reference.yaw)
+        choices = self.choices(subject.name, taken)
+        areas = tuple(enumerate(problem.goal_regions(reference)))
+        for choice, (number, area) in ((choice, area) for choice in choices for area in areas):
+            key = (gone, choice, reference.position, reference.yaw, number)
             if key not in self._goal_poses:
                 bottom = reference.top if problem.goal.predicate.stacked else 0.0
                 if standing is None:
                     standing = problem.standing(gone | {subject.name, reference.name})
                     standing = np.vstack([standing, obstacle(reference)])
-                area = problem.goal_region(reference)
                 found = self._find(area, area[:2], bottom, subject, choice, standing)
                 self._goal_poses[key] = found
             found = self._goal_poses[key]
@@ -235,9 +236,7 @@ class PoseBound:
         table, at = problem.table, problem.arm.base
 
         def find(ease: float) -> tuple[int, float]:
-            return find_pose(
-                area, prefer, bottom, parts, obstacles, table, at, reach, ease, pose
-            )
+            return find_pose(area, prefer, bottom, parts, obstacles, table, at, reach, ease, pose)
 
         status, spare = find(0.0)
         found = None
@@ -288,7 +287,10 @@ class PoseBound:
         """Parts and reach of the ways in which a box can be put down, as `slack` has them."""
         parts = np.array([_turned(one.parts) if turn else one.parts for one, turn in ways])
         reach = np.array(
-            [(*self.interval(bottom, box, one), *self._facing(box, one, turn)) for one, turn in ways]
+            [
+                (*self.interval(bottom, box, one), *self._facing(box, one, turn))
+                for one, turn in ways
+            ]
         )
         return parts, reach
 

@@ -18,7 +18,7 @@ from relevance.planner import logic
 from relevance.planner.kernels.kinematics import Arm, arm_at
 from relevance.planner.result import Counts, Seconds
 from relevance.robot import panda
-from relevance.scene import Box, Goal, Scene, footprint_gap
+from relevance.scene import Box, Goal, Rectangle, Scene, footprint_gap
 from relevance.scene.geometry import UPRIGHT, upright
 
 REGION_MARGIN = 0.0005
@@ -53,7 +53,7 @@ class Problem:
     tall: bool = field(init=False)
     """Whether a box is so high that it could meet the links near the base."""
     arm: Arm = field(init=False)
-    _regions: dict[tuple, np.ndarray] = field(init=False, default_factory=dict)
+    _regions: dict[tuple, tuple[np.ndarray, ...]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.boxes = {box.name: box for box in self.scene.objects}
@@ -107,14 +107,29 @@ class Problem:
         stays = [i for name, i in self.index.items() if name not in gone]
         return self.obstacles[stays]
 
-    def goal_region(self, reference: Box) -> np.ndarray:
-        """Rectangle for the subject's centre: x, y, angle, half extents (5,)."""
+    def goal_regions(self, reference: Box) -> tuple[np.ndarray, ...]:
+        """Rectangles for the subject's centre: x, y, angle, half extents (5,) each."""
         place = (reference.position, reference.yaw)
         if place not in self._regions:
-            there = self.goal.predicate.region(self.subject, reference, self.scene.robot)
-            half = [max(extent - REGION_MARGIN, 0.0) for extent in there.half]
-            self._regions[place] = np.array([there.x, there.y, there.angle, *half])
+            region = self.goal.predicate.region(self.subject, reference, self.scene.robot)
+            self._regions[place] = tuple(map(_area, region.rectangles))
         return self._regions[place]
+
+    def goal_region(self, reference: Box, x: float, y: float) -> np.ndarray:
+        """The one of them that a point lies in, the deepest."""
+        return min(self.goal_regions(reference), key=lambda area: _outside(area, x, y))
+
+
+def _area(there: Rectangle) -> np.ndarray:
+    half = [max(extent - REGION_MARGIN, 0.0) for extent in there.half]
+    return np.array([there.x, there.y, there.angle, *half])
+
+
+def _outside(area: np.ndarray, x: float, y: float) -> float:
+    """How far a point lies outside a rectangle (5,), along its axes; negative inside, m."""
+    c, s = math.cos(area[2]), math.sin(area[2])
+    dx, dy = x - area[0], y - area[1]
+    return max(abs(c * dx + s * dy) - area[3], abs(c * dy - s * dx) - area[4])
 
 
 @njit(cache=True)

@@ -443,21 +443,22 @@ class _Search:
         """Objects whose leaving can make room in the goal region; and the reference."""
         problem = self.problem
         subject, reference = problem.subject, problem.reference
-        x, y, angle, a, b = problem.goal_region(reference)
         spread = max(
             math.hypot(abs(part[0]) + part[2], part[3])
             for grasp in self.pose.grasps(subject.name)
             for part in grasp.parts
         )
-        area = Box(
-            name="area",
-            size=(2 * (a + spread) + 0.02, 2 * (b + spread) + 0.02, 1.0),
-            position=(x, y, 0.5),
-            yaw=angle,
-            color=(0.0, 0.0, 0.0),
-        )
-        near = {box.name for box in problem.scene.objects if footprint_gap(area, box) <= 0}
-        return frozenset(near | {reference.name}) - {subject.name}
+        near = {reference.name}
+        for x, y, angle, a, b in problem.goal_regions(reference):
+            area = Box(
+                name="area",
+                size=(2 * (a + spread) + 0.02, 2 * (b + spread) + 0.02, 1.0),
+                position=(x, y, 0.5),
+                yaw=angle,
+                color=(0.0, 0.0, 0.0),
+            )
+            near |= {box.name for box in problem.scene.objects if footprint_gap(area, box) <= 0}
+        return frozenset(near) - {subject.name}
 
     def _in_the_way(self, chosen: frozenset[str]) -> frozenset[str]:
         """What blocks the picks that a set needs: the subject's by any grasp, and its own."""

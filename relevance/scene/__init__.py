@@ -31,6 +31,7 @@ from relevance.scene.predicates import (
     Goal,
     Predicate,
     Rectangle,
+    Region,
     goal_holds,
 )
 from relevance.scene.projection import camera_up, pinhole, project, vertices
@@ -53,6 +54,7 @@ __all__ = [
     "Pose",
     "Predicate",
     "Rectangle",
+    "Region",
     "Robot",
     "Scene",
     "SceneError",
