@@ -295,8 +295,11 @@ class PoseBound:
         return parts, reach
 
     def _facing(self, box: Box, grasp: Grasp, turn: int) -> tuple[float, float]:
-        """Where the finger axis may point at the place, seen from the robot: middle and half width,
-        rad. A shifted hand is the same way round at pick and place, and its last joint has limits."""
+        """Where the finger axis may point at the place, against its bearing from the robot: middle
+        and half width, rad.
+
+        A shifted hand is the same way round at pick and place, and its last joint has limits.
+        """
         x, y, _, angle = pick_target(box, grasp).tolist()
         base, limit = self.problem.arm.base, float(self.problem.arm.upper[-1])
         seen = angle - math.atan2(y - base[1], x - base[0])

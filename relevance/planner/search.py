@@ -17,7 +17,7 @@ import math
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import islice
 
 from relevance.planner import logic
@@ -406,11 +406,8 @@ class _Search:
                     others |= {chosen | {name} for name in rank if name not in chosen}
             if found:
                 return found
-
-            def key(names: frozenset[str]) -> list[int]:
-                return sorted(rank[name] for name in names)
-
-            frontier, rest = sorted(following, key=key), sorted(others - following, key=key)
+            frontier = sorted(following, key=partial(_ranks, rank))
+            rest = sorted(others - following, key=partial(_ranks, rank))
         self.cut |= bool(frontier or rest)
         return []
 
@@ -512,3 +509,7 @@ class _Search:
         if next(prefixes, None) is not None:
             problem.open.add(f"more than {ORDERS} orders of one set")
         return None
+
+
+def _ranks(rank: Mapping[str, int], names: frozenset[str]) -> list[int]:
+    return sorted(rank[name] for name in names)
