@@ -19,7 +19,14 @@ from relevance.planner.kernels.boxes import (
     banded_solve,
     separation,
 )
-from relevance.planner.kernels.kinematics import FRAME, arm_at, functions, hand_down, reach_interval
+from relevance.planner.kernels.kinematics import (
+    FRAME,
+    arm_at,
+    finger_way,
+    functions,
+    hand_down,
+    reach_interval,
+)
 from relevance.planner.kernels.native import call
 from relevance.planner.pose import FOUND, NONE
 from relevance.robot import ARM, LINKS, panda, panda_urdf
@@ -137,6 +144,18 @@ def test_hand_down_solves_the_grasp_exactly():
         assert np.abs(functions().grasp.y[:6]).max() < 1e-9
         assert frames_at(q)[2, 3:12].reshape(3, 3)[2, 2] < -0.999, "the hand points down"
     assert reached > 200
+
+
+def test_hand_down_turns_the_hand_the_way_it_is_asked():
+    arm, at, rng, q, seen = panda(), arm_at(BASE), np.random.default_rng(4), np.zeros(7), set()
+    for _ in range(200):
+        target = np.array([rng.uniform(-0.2, 0.2), rng.uniform(-0.4, 0.4), rng.uniform(0.1, 0.3),
+                           rng.uniform(-4, 4)])  # fmt: skip
+        for way in (1.0, -1.0):
+            if hand_down(target, BASE, arm.lower, arm.upper, q, way):
+                seen.add(way)
+                assert finger_way(at, q, target[3]) == way, "what it holds off centre lies so"
+    assert seen == {1.0, -1.0}
 
 
 def test_reach_interval_is_what_hand_down_reaches():
@@ -327,7 +346,8 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
         region = np.array([0.0, 0.0, 0.2, 0.05, 0.03])
         near, far = reach_interval(0.15)
         at = np.zeros(4)
-        common = (0.0, grasp.parts[None], obstacles, table, BASE, np.array([near]), np.array([far]))
+        reach = np.array([[near, far, 0.0, pose.ANY_TURN]])
+        common = (0.0, grasp.parts[None], obstacles, table, BASE, reach)
         status, _ = pose.find_pose(region, np.zeros(2), *common, 0.0, at)
         c, s = math.cos(0.2), math.sin(0.2)
         grid = max(

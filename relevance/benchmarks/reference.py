@@ -333,13 +333,16 @@ class _Exhaustion:
     def _region(self) -> np.ndarray:
         """Grid points (N, 2) of the goal region for the subject's centre, from border to border."""
         scene, goal = self.scene, self.goal
-        steps = np.linspace(-1, 1, CELLS)
-        there = goal.predicate.region(scene[goal.subject], scene[goal.reference], scene.robot)
-        half = [max(extent - max(self.clearance - CLEARANCE, 0.0), 0.0) for extent in there.half]
-        a, b = np.meshgrid(steps * half[0], steps * half[1])
-        c, s = math.cos(there.angle), math.sin(there.angle)
-        local = np.stack([c * a - s * b, s * a + c * b], axis=-1)
-        return local.reshape(-1, 2) + np.array([there.x, there.y])
+        steps, inset = np.linspace(-1, 1, CELLS), max(self.clearance - CLEARANCE, 0.0)
+        region = goal.predicate.region(scene[goal.subject], scene[goal.reference], scene.robot)
+        points = []
+        for there in region.rectangles:
+            half = [max(extent - inset, 0.0) for extent in there.half]
+            a, b = np.meshgrid(steps * half[0], steps * half[1])
+            c, s = math.cos(there.angle), math.sin(there.angle)
+            local = np.stack([c * a - s * b, s * a + c * b], axis=-1)
+            points.append(local.reshape(-1, 2) + np.array([there.x, there.y]))
+        return np.concatenate(points)
 
     def _orders(self, chosen: Sequence[str]) -> Iterator[tuple[str, ...]]:
         """Orders in which these boxes can be taken one after the other."""

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
 
 from relevance.planner.grasps import bodies
 from relevance.planner.kernels.kinematics import FRAME, look_at_frames
@@ -27,11 +28,9 @@ def broken(problem: Problem, motion: Motion) -> str:
     """
     arm = panda()
     for number, phase in enumerate(motion.phases):
-        over = np.maximum(arm.lower - phase.q, phase.q - arm.upper).max(axis=0)
-        if over.max() > SLACK:
-            joint = int(over.argmax())
-            return f"phase {number}: joint {joint + 1} exceeds its limit by {over[joint]:.4f} rad"
-        speed = (np.abs(np.diff(phase.q, axis=0)) / arm.velocity).max() / phase.dt
+        joint, over, speed = extremes(phase.q, phase.dt, arm.lower, arm.upper, arm.velocity)
+        if over > SLACK:
+            return f"phase {number}: joint {joint + 1} exceeds its limit by {over:.4f} rad"
         if speed > 1 + SLACK:
             return f"phase {number}: a joint moves at {speed:.2f} times its speed limit"
     if motion.max_penetration > ALLOWED:
@@ -41,6 +40,21 @@ def broken(problem: Problem, motion: Motion) -> str:
     if not goal_holds(boxes, problem.goal, problem.scene.robot):
         return f"the goal {problem.goal} is not true at the end"
     return ""
+
+
+@njit(cache=True)
+def extremes(q, dt, lower, upper, velocity):
+    """The joint nearest to or farthest beyond its limits in the rows q (T + 1, 7), how far beyond
+    (rad), and the highest speed as a share of its limit."""
+    joint, over, speed = 0, -math.inf, 0.0
+    for t in range(len(q)):
+        for i in range(len(lower)):
+            beyond = max(lower[i] - q[t, i], q[t, i] - upper[i])
+            if beyond > over:
+                joint, over = i, beyond
+            if t > 0:
+                speed = max(speed, abs(q[t, i] - q[t - 1, i]) / velocity[i] / dt)
+    return joint, over, speed
 
 
 def at_last(box: Box, pose: Pose | None) -> Box:

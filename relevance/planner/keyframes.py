@@ -146,7 +146,7 @@ class KeyframeBound:
         x[14 * m :] = p0
         switches = Switches(
             HOME, pick, place_z, turn, link, centre, half, radius, n_bodies, problem.obstacles,
-            stands, moved, supports, problem.goal_region(reference), bounds,
+            stands, moved, supports, problem.goal_region(reference, *p0[-3:-1]), bounds,
         )  # fmt: skip
         start = x.copy()
         for stay in STAY:

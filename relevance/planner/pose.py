@@ -18,8 +18,8 @@ from itertools import compress, islice
 import numpy as np
 from numba import njit
 
-from relevance.planner.grasps import Family, Grasp, deep_grasps, other_grasps
-from relevance.planner.kernels.kinematics import reach_interval
+from relevance.planner.grasps import Family, Grasp, deep_grasps, other_grasps, pick_target
+from relevance.planner.kernels.kinematics import facing, reach_interval
 from relevance.planner.problem import CLOSE, Problem, obstacle
 from relevance.scene import Box
 from relevance.scene.geometry import UPRIGHT, rectangle_gap, upright
@@ -40,6 +40,9 @@ REACH_MARGIN = 0.004
 """Distance kept from the ends of the arm's reach, m."""
 REFERENCE_PLACES = ((0.0, 0.0), (-0.1, 0.25), (-0.1, -0.25), (0.1, 0.15), (0.1, -0.15))
 """Where to look for room for a reference that is moved (x, y), m."""
+TURN, TURN_MARGIN, ANY_TURN = 0.1, 0.02, 4.0
+"""What a turn of the last joint counts against a distance, m/rad (less than the hand is long);
+what it keeps from its limit, and a half width that is none, rad."""
 HAND_REACH = 0.2
 """Farther from a box nothing is in the way of the hand that takes it, m."""
 SKY = 2.0
@@ -65,6 +68,7 @@ class PoseBound:
         self._blockers: dict[str, dict[Grasp, frozenset[str]]] = {}
         self._more: dict[str, dict[Grasp, frozenset[str]]] = {}
         self._goal_poses: dict[tuple, Placement | None] = {}
+        self._held: dict[tuple[tuple[Grasp, ...], float], tuple] = {}
         self._intervals: dict[float, tuple[float, float]] = {}
 
     def blockers(self, name: str) -> dict[Grasp, frozenset[str]]:
@@ -124,14 +128,15 @@ class PoseBound:
         subject = problem.subject
         standing: np.ndarray | None = None
         taken = frozenset(problem.boxes) if everywhere else gone
-        for choice in self.choices(subject.name, taken):
-            key = (gone, choice, reference.position, reference.yaw)
+        choices = self.choices(subject.name, taken)
+        areas = tuple(enumerate(problem.goal_regions(reference)))
+        for choice, (number, area) in ((choice, area) for choice in choices for area in areas):
+            key = (gone, choice, reference.position, reference.yaw, number)
             if key not in self._goal_poses:
                 bottom = reference.top if problem.goal.predicate.stacked else 0.0
                 if standing is None:
                     standing = problem.standing(gone | {subject.name, reference.name})
                     standing = np.vstack([standing, obstacle(reference)])
-                area = problem.goal_region(reference)
                 found = self._find(area, area[:2], bottom, subject, choice, standing)
                 self._goal_poses[key] = found
             found = self._goal_poses[key]
@@ -222,39 +227,26 @@ class PoseBound:
         """
         began, problem = time.process_time(), self.problem
         problem.counts.pose += 1
-        shallow = list({grasp.shift: grasp for grasp in choice}.values())
-        # Shifted to one side, or to the other and turned: the hand is at the same place.
-        sides = {
-            -grasp.shift if turn else grasp.shift: (grasp, turn)
-            for turn in (1, 0)
-            for grasp in shallow
-        }
-        ways = sorted(sides.values(), key=lambda way: way[0].price)
-        pose, prefer = np.zeros(4), np.array(prefer)
+        key = (choice, bottom)
+        if key not in self._held:
+            ways = self._ways(choice, box)
+            self._held[key] = ways, *self._held_so(ways, box, bottom)
+        ways, parts, reach = self._held[key]
+        pose, prefer = np.zeros(4), np.asarray(prefer)
         table, at = problem.table, problem.arm.base
 
-        def bounds(held: list[tuple[Grasp, int]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            parts = np.array([_turned(one.parts) if turn else one.parts for one, turn in held])
-            reach = np.array([self.interval(bottom, box, grasp) for grasp, _ in held]).T
-            return parts, np.ascontiguousarray(reach[0]), np.ascontiguousarray(reach[1])
-
-        parts, near, far = bounds(ways)
-
         def find(ease: float) -> tuple[int, float]:
-            return find_pose(
-                area, prefer, bottom, parts, obstacles, table, at, near, far, ease, pose
-            )
+            return find_pose(area, prefer, bottom, parts, obstacles, table, at, reach, ease, pose)
 
         status, spare = find(0.0)
         found = None
         if status == FOUND:
-            x, y, angle = (float(value) for value in pose[:3])
-            grasp, turn = ways[int(pose[3])]
+            x, y, angle, way = pose.tolist()
+            grasp, turn = ways[int(way)]
             for deeper in choice:
                 if deeper.shift == grasp.shift and deeper.depth > grasp.depth:
-                    held = bounds([(deeper, turn)])
-                    there = (x, y, angle, bottom, held[0], obstacles, table, at, *held[1:])
-                    value, _ = slack(*there, 0.0)
+                    held, there = self._held_so([(deeper, turn)], box, bottom)
+                    value, _ = slack(x, y, angle, bottom, held, obstacles, table, at, there, 0.0)
                     if value >= 0:
                         grasp = deeper
                         break
@@ -268,6 +260,53 @@ class PoseBound:
         problem.undecided |= close
         problem.seconds.pose += time.process_time() - began
         return found
+
+    def _ways(self, choice: tuple[Grasp, ...], box: Box) -> list[tuple[Grasp, int]]:
+        """The shallowest grasp of each shift, and whether the hand is turned by half a turn.
+
+        Shifted to one side, or to the other and turned, the hand is at the same place: the second
+        counts where the first may not point everywhere.
+        """
+        shallow = {grasp.shift: grasp for grasp in choice}.values()
+        sides = [
+            (grasp.price, -grasp.shift if turn else grasp.shift, turn, grasp)
+            for grasp in shallow
+            for turn in ((0, 1) if grasp.shift else (0,))
+        ]
+        found, settled = [], set()
+        for _, side, turn, grasp in sorted(sides, key=lambda one: one[:3]):
+            if side not in settled:
+                found.append((grasp, turn))
+                if self._facing(box, grasp, turn)[1] == ANY_TURN:
+                    settled.add(side)
+        return found
+
+    def _held_so(
+        self, ways: list[tuple[Grasp, int]], box: Box, bottom: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Parts and reach of the ways in which a box can be put down, as `slack` has them."""
+        parts = np.array([_turned(one.parts) if turn else one.parts for one, turn in ways])
+        reach = np.array(
+            [
+                (*self.interval(bottom, box, one), *self._facing(box, one, turn))
+                for one, turn in ways
+            ]
+        )
+        return parts, reach
+
+    def _facing(self, box: Box, grasp: Grasp, turn: int) -> tuple[float, float]:
+        """Where the finger axis may point at the place, against its bearing from the robot: middle
+        and half width, rad.
+
+        A shifted hand is the same way round at pick and place, and its last joint has limits.
+        """
+        x, y, _, angle = pick_target(box, grasp).tolist()
+        base, limit = self.problem.arm.base, float(self.problem.arm.upper[-1])
+        seen = angle - math.atan2(y - base[1], x - base[0])
+        ways = [way for way in (1.0, -1.0) if abs(_wrapped(seen - facing(way))) <= limit]
+        if grasp.shift == 0.0 or len(ways) != 1:
+            return 0.0, ANY_TURN
+        return facing(ways[0]) - turn * math.pi, limit
 
     def _references(self, order: tuple[str, ...]) -> Iterator[Box]:
         """The reference where it stands, or where it might be put if the order moves it."""
@@ -337,6 +376,10 @@ class PoseBound:
             pose = (*box.position[:2], angle)
             found.append(volumes(grasp.parts, pose, box.bottom, 0.0, SKY)[1:])
         return found
+
+
+def _wrapped(angle: float) -> float:
+    return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def moved_box(box: Box, place: Placement) -> Box:
@@ -425,11 +468,12 @@ def volumes(parts, pose, bottom, top, sky):
 
 
 @njit(cache=True)
-def slack(x, y, angle, bottom, parts, obstacles, table, base, near, far, enough):
+def slack(x, y, angle, bottom, parts, obstacles, table, base, reach, enough):
     """How well (x, y, angle) satisfies clearance, table edge and reach; feasible iff >= 0. m.
 
-    parts (V, 5, 5), near and far (V,): of the ways in which the hand may hold the box; the best
-    counts. Below `-enough` it is not computed to the end. Returns (slack, which way).
+    parts (V, 5, 5), reach (V, 4: distances near and far, middle and half width of the finger axis'
+    turn against the bearing): of the ways in which the hand may hold the box; the best counts.
+    Below `-enough` it is not computed to the end. Returns (slack, which way).
     """
     c, s = abs(math.cos(angle)), abs(math.sin(angle))
     along, across = parts[0, 0, 2], parts[0, 0, 3]
@@ -443,7 +487,13 @@ def slack(x, y, angle, bottom, parts, obstacles, table, base, near, far, enough)
         return shared, 0
     best, which = -1.0, 0
     for v in range(len(parts)):
-        worst = min(shared, min(far[v] - r, r - near[v]))
+        worst = min(shared, min(reach[v, 1] - r, r - reach[v, 0]))
+        if reach[v, 3] < ANY_TURN:
+            left = parts[v, -1, 1]
+            hx, hy = x - left * math.sin(angle) - base[0], y + left * math.cos(angle) - base[1]
+            off = angle - math.atan2(hy, hx) - reach[v, 2]
+            off -= 2 * math.pi * math.floor(off / (2 * math.pi) + 0.5)
+            worst = min(worst, TURN * (reach[v, 3] - TURN_MARGIN - abs(off)))
         if worst > best:
             hand = clearance(x, y, angle, bottom, parts[v, 1:], obstacles) - MARGIN
             worst = min(worst, hand)
@@ -455,11 +505,11 @@ def slack(x, y, angle, bottom, parts, obstacles, table, base, near, far, enough)
 
 
 @njit(cache=True)
-def find_pose(region, prefer, bottom, parts, obstacles, table, base, near, far, ease, pose):
+def find_pose(region, prefer, bottom, parts, obstacles, table, base, reach, ease, pose):
     """Branch and bound for a free pose whose centre lies in a rectangle.
 
     region: centre x, y, angle, half extents (5,). prefer (x, y): where to look first. parts,
-    near, far: as `slack` has them. ease: how much every constraint is relaxed, m. Fills pose
+    reach: as `slack` has them. ease: how much every constraint is relaxed, m. Fills pose
     (x, y, angle of the finger axis, which of the parts) with the first comfortable pose of the
     coarsest level that has a free one, or the clearest of that level.
     Returns (FOUND | NONE | UNDECIDED, the slack of the best pose seen, m).
@@ -473,10 +523,10 @@ def find_pose(region, prefer, bottom, parts, obstacles, table, base, near, far, 
         for i in range(parts.shape[1]):
             offset, left = abs(parts[v, i, 0]), abs(parts[v, i, 1])
             if left == 0.0:
-                reach = offset + math.sqrt(parts[v, i, 2] ** 2 + parts[v, i, 3] ** 2)
+                outer = offset + math.sqrt(parts[v, i, 2] ** 2 + parts[v, i, 3] ** 2)
             else:
-                reach = math.sqrt((offset + parts[v, i, 2]) ** 2 + (left + parts[v, i, 3]) ** 2)
-            spin = max(spin, reach)
+                outer = math.sqrt((offset + parts[v, i, 2]) ** 2 + (left + parts[v, i, 3]) ** 2)
+            spin = max(spin, outer)
     count = nx * ny * na
     cells = np.empty((count, 3))
     key = np.empty(count)
@@ -501,9 +551,8 @@ def find_pose(region, prefer, bottom, parts, obstacles, table, base, near, far, 
             x = region[0] + c * cells[n, 0] - s * cells[n, 1]
             y = region[1] + s * cells[n, 0] + c * cells[n, 1]
             value, which = slack(
-                x, y, cells[n, 2], bottom, parts, obstacles, table, base, near, far,
-                lipschitz + ease,
-            )  # fmt: skip
+                x, y, cells[n, 2], bottom, parts, obstacles, table, base, reach, lipschitz + ease
+            )
             value += ease
             evaluations += 1
             keep[n] = value + lipschitz >= 0

@@ -9,14 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
+from numba import njit
 
 from relevance.planner import logic
 from relevance.planner.kernels.kinematics import Arm, arm_at
 from relevance.planner.result import Counts, Seconds
 from relevance.robot import panda
-from relevance.scene import Box, Goal, Scene, footprint_gap
+from relevance.scene import Box, Goal, Rectangle, Scene, footprint_gap
 from relevance.scene.geometry import UPRIGHT, upright
 
 REGION_MARGIN = 0.0005
@@ -51,14 +53,13 @@ class Problem:
     tall: bool = field(init=False)
     """Whether a box is so high that it could meet the links near the base."""
     arm: Arm = field(init=False)
-    whole_arm: Arm = field(init=False)
-    """The same with the links near the base."""
+    _regions: dict[tuple, tuple[np.ndarray, ...]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.boxes = {box.name: box for box in self.scene.objects}
         self.index = {name: i for i, name in enumerate(self.boxes)}
         base = np.array([*self.scene.robot.base, self.scene.robot.yaw])
-        self.arm, self.whole_arm = arm_at(base), arm_at(base, upper=True)
+        self.arm = arm_at(base)
         self.table = np.array(self.scene.table.size) / 2
         standing = [obstacle(box) for box in self.scene.objects]
         self._unsink(np.array(standing), standing)
@@ -66,6 +67,11 @@ class Problem:
         tops = [box.top for box in self.scene.objects]
         self.tall = max(tops) - self.scene.robot.base[2] > LOW
         self.above = logic.stacked_on(self.scene)
+
+    @cached_property
+    def whole_arm(self) -> Arm:
+        """The arm with the links near the base."""
+        return arm_at(self.arm.base, upper=True)
 
     @property
     def subject(self) -> Box:
@@ -80,11 +86,7 @@ class Problem:
     def _unsink(self, rows: np.ndarray, standing: list[np.ndarray]) -> None:
         """Shrink boxes that are sunk into others (a scene may have that, up to a millimetre), so
         that they only touch."""
-        apart = np.hypot(*(rows[:, None, :2] - rows[None, :, :2]).transpose(2, 0, 1))
-        beside = apart < rows[:, None, 7] + rows[None, :, 7]
-        heights = rows[:, None, 6] + rows[None, :, 6] - 1e-3  # what stands on another is not beside
-        beside &= np.abs(rows[:, None, 2] - rows[None, :, 2]) < heights
-        for i, k in zip(*np.nonzero(np.triu(beside, 1)), strict=True):
+        for i, k in _neighbours(rows):
             sunk = -footprint_gap(self.scene.objects[i], self.scene.objects[k])
             for row in (standing[i], standing[k]) if sunk > 0 else ():
                 x, y, z, yaw, hx, hy, hz = row[:7]
@@ -105,11 +107,44 @@ class Problem:
         stays = [i for name, i in self.index.items() if name not in gone]
         return self.obstacles[stays]
 
-    def goal_region(self, reference: Box) -> np.ndarray:
-        """Rectangle for the subject's centre: x, y, angle, half extents (5,)."""
-        there = self.goal.predicate.region(self.subject, reference, self.scene.robot)
-        half = [max(extent - REGION_MARGIN, 0.0) for extent in there.half]
-        return np.array([there.x, there.y, there.angle, *half])
+    def goal_regions(self, reference: Box) -> tuple[np.ndarray, ...]:
+        """Rectangles for the subject's centre: x, y, angle, half extents (5,) each."""
+        place = (reference.position, reference.yaw)
+        if place not in self._regions:
+            region = self.goal.predicate.region(self.subject, reference, self.scene.robot)
+            self._regions[place] = tuple(map(_area, region.rectangles))
+        return self._regions[place]
+
+    def goal_region(self, reference: Box, x: float, y: float) -> np.ndarray:
+        """The one of them that a point lies in, the deepest."""
+        return min(self.goal_regions(reference), key=lambda area: _outside(area, x, y))
+
+
+def _area(there: Rectangle) -> np.ndarray:
+    half = [max(extent - REGION_MARGIN, 0.0) for extent in there.half]
+    return np.array([there.x, there.y, there.angle, *half])
+
+
+def _outside(area: np.ndarray, x: float, y: float) -> float:
+    """How far a point lies outside a rectangle (5,), along its axes; negative inside, m."""
+    c, s = math.cos(area[2]), math.sin(area[2])
+    dx, dy = x - area[0], y - area[1]
+    return max(abs(c * dx + s * dy) - area[3], abs(c * dy - s * dx) - area[4])
+
+
+@njit(cache=True)
+def _neighbours(rows):
+    """The pairs (K, 2) of boxes (N, UPRIGHT) whose footprints could overlap at the same height."""
+    found, count = np.empty((len(rows) * (len(rows) - 1) // 2, 2), np.int64), 0
+    for i in range(len(rows)):
+        for k in range(i + 1, len(rows)):
+            a, b = rows[i], rows[k]
+            apart = math.hypot(a[0] - b[0], a[1] - b[1])
+            # what stands on another is not beside it
+            if apart < a[7] + b[7] and abs(a[2] - b[2]) < a[6] + b[6] - 1e-3:
+                found[count, 0], found[count, 1] = i, k
+                count += 1
+    return found[:count]
 
 
 def obstacle(box: Box) -> np.ndarray:

@@ -17,7 +17,7 @@ import math
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import islice
 
 from relevance.planner import logic
@@ -42,6 +42,8 @@ from relevance.scene import Box, Goal, Scene, footprint_gap, goal_holds
 
 TRIES = 200
 """How many sets are looked at to say what stands in the way."""
+LOOK = 2
+"""From how many objects on the search first asks which can be picked at all."""
 ORDERS = 6
 """How many orders of a set `informed` tries."""
 COST_TOLERANCE = 1e-3
@@ -260,12 +262,9 @@ class _Search:
 
     def _might(self) -> bool:
         """Whether a plan is possible once all that can leave has left, or the reference moves."""
-        problem, goal = self.problem, self.problem.goal
+        goal = self.problem.goal
         gone = frozenset(self.order) - self.stuck - {goal.subject, goal.reference}
-        return self._reference_moves() or (
-            self.pose.pickable(goal.subject, gone)
-            and (any(self.pose.goal_poses(gone, problem.reference)) or bool(problem.open))
-        )
+        return self._reference_moves() or self._works(gone)
 
     def _stuck(self) -> frozenset[str]:
         """What can never be picked: it cannot be grasped, or carries what does not leave first."""
@@ -366,8 +365,12 @@ class _Search:
         """Breadth-first over sequences of objects moved before the subject."""
         subject = self.problem.goal.subject
         frontier: list[tuple[str, ...]] = [()]
-        for _ in range(self.config.max_actions // 2):
+        for level in range(self.config.max_actions // 2):
             found, following = [], []
+            if level == LOOK:
+                movable = self._leaving(movable)
+                if not (required or self._works(frozenset(movable))):
+                    return []
             for prefix in frontier:
                 self._visit()
                 if required <= set(prefix):
@@ -394,8 +397,15 @@ class _Search:
         subject, near = self.problem.goal.subject, self._beside_goal()
         rank = {name: i for i, name in enumerate(movable) if name != subject}
         frontier, rest = [frozenset[str]()], list[frozenset[str]]()
-        for _ in range(self.config.max_actions // 2):
+        for level in range(self.config.max_actions // 2):
             found, following, others = [], set(), set()
+            if level == LOOK:
+                leaving = frozenset(self._leaving(list(rank)))
+                if not (required or self._works(leaving)):
+                    return []
+                rank = {name: i for name, i in rank.items() if name in leaving}
+                frontier = [chosen for chosen in frontier if chosen <= leaving]
+                rest = [chosen for chosen in rest if chosen <= leaving]
             for chosen in self._tiers(frontier, rest, found):
                 self._visit()
                 self.late = False
@@ -411,13 +421,27 @@ class _Search:
                     others |= {chosen | {name} for name in rank if name not in chosen}
             if found:
                 return found
-
-            def key(names: frozenset[str]) -> list[int]:
-                return sorted(rank[name] for name in names)
-
-            frontier, rest = sorted(following, key=key), sorted(others - following, key=key)
+            frontier = sorted(following, key=partial(_ranks, rank))
+            rest = sorted(others - following, key=partial(_ranks, rank))
         self.cut |= bool(frontier or rest)
         return []
+
+    def _leaving(self, names: list[str]) -> list[str]:
+        """Those of these objects that can ever be picked: once what is in their way has left."""
+        gone = frozenset[str]()
+        while True:
+            more = {name for name in names if name not in gone and self.pose.pickable(name, gone)}
+            more.discard(self.problem.goal.subject)
+            if not more:
+                return [name for name in names if name in gone]
+            gone |= more
+
+    def _works(self, gone: frozenset[str]) -> bool:
+        """Whether the subject can be taken and put down once these have left."""
+        problem = self.problem
+        return self.pose.pickable(problem.goal.subject, gone) and (
+            any(self.pose.goal_poses(gone, problem.reference)) or bool(problem.open)
+        )
 
     def _tiers(
         self, first: list[frozenset[str]], rest: list[frozenset[str]], found: list[Motion]
@@ -431,21 +455,22 @@ class _Search:
         """Objects whose leaving can make room in the goal region; and the reference."""
         problem = self.problem
         subject, reference = problem.subject, problem.reference
-        x, y, angle, a, b = problem.goal_region(reference)
         spread = max(
             math.hypot(abs(part[0]) + part[2], part[3])
             for grasp in self.pose.grasps(subject.name)
             for part in grasp.parts
         )
-        area = Box(
-            name="area",
-            size=(2 * (a + spread) + 0.02, 2 * (b + spread) + 0.02, 1.0),
-            position=(x, y, 0.5),
-            yaw=angle,
-            color=(0.0, 0.0, 0.0),
-        )
-        near = {box.name for box in problem.scene.objects if footprint_gap(area, box) <= 0}
-        return frozenset(near | {reference.name}) - {subject.name}
+        near = {reference.name}
+        for x, y, angle, a, b in problem.goal_regions(reference):
+            area = Box(
+                name="area",
+                size=(2 * (a + spread) + 0.02, 2 * (b + spread) + 0.02, 1.0),
+                position=(x, y, 0.5),
+                yaw=angle,
+                color=(0.0, 0.0, 0.0),
+            )
+            near |= {box.name for box in problem.scene.objects if footprint_gap(area, box) <= 0}
+        return frozenset(near) - {subject.name}
 
     def _in_the_way(self, chosen: frozenset[str]) -> frozenset[str]:
         """What blocks the picks that a set needs: the subject's by any grasp, and its own."""
@@ -456,6 +481,8 @@ class _Search:
     def _orders(self, chosen: frozenset[str]) -> Iterator[tuple[str, ...]]:
         """The orders in which a set can be picked; scores have no say in it."""
         names = [name for name in self.problem.boxes if name in chosen]
+        if len(self._leaving(names)) < len(names):
+            return iter(())  # what can be picked now can be picked later: no other order helps
 
         def extend(prefix: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
             if len(prefix) == len(chosen):
@@ -497,3 +524,7 @@ class _Search:
         if next(prefixes, None) is not None:
             problem.open.add(f"more than {ORDERS} orders of one set")
         return None
+
+
+def _ranks(rank: Mapping[str, int], names: frozenset[str]) -> list[int]:
+    return sorted(rank[name] for name in names)

@@ -2,8 +2,7 @@
 
 Directions are the robot's: left is +y of its base frame, in front is nearer to it, wherever it
 stands and however it is turned. A new
-relation is one more object here; one whose region is of another shape also needs a rule for
-that shape in the planner (`planner.pose`).
+relation is one more object here; one whose region is of another shape brings a class of `Region`.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass as plain_dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 from pydantic import AfterValidator, BeforeValidator, InstanceOf, PlainSerializer
 
@@ -25,9 +24,23 @@ GAP = 0.05
 """Depth of a same-plane goal region, m (CONTRIBUTING, The words)."""
 
 
+class Region(Protocol):
+    """Where the subject's centre may be, on the plane that it stands on."""
+
+    @property
+    def rectangles(self) -> tuple[Rectangle, ...]:
+        """Rectangles within it that together are all of it: planners look nowhere else, so what
+        they leave out is a plan that may be missed."""
+        ...
+
+    def contains(self, x: float, y: float, tolerance: float = 0.0) -> bool:
+        """Whether a point lies in it, or at most `tolerance` (m) outside: the definition."""
+        ...
+
+
 @plain_dataclass(frozen=True, slots=True, kw_only=True)
 class Rectangle:
-    """Where the subject's centre may be: a rectangle on the plane that it stands on."""
+    """A region that is a rectangle."""
 
     x: float
     y: float
@@ -36,6 +49,11 @@ class Rectangle:
     """Turn of its own axes about z, rad."""
     half: tuple[float, float]
     """Half extents along its own axes, m."""
+
+    @property
+    def rectangles(self) -> tuple[Rectangle, ...]:
+        """Itself."""
+        return (self,)
 
     def contains(self, x: float, y: float, tolerance: float = 0.0) -> bool:
         """Whether a point lies in it, or at most `tolerance` (m) outside along its axes."""
@@ -71,7 +89,7 @@ class Predicate(ABC):
         return None
 
     @abstractmethod
-    def region(self, subject: Box, reference: Box, robot: Robot) -> Rectangle:
+    def region(self, subject: Box, reference: Box, robot: Robot) -> Region:
         """Where the subject's centre may be."""
 
     def holds(self, subject: Box, reference: Box, robot: Robot, tolerance: float = 1e-3) -> bool:

@@ -186,9 +186,15 @@ def hand_down(target, base, lower, upper, q, way=0.0):
     if way == 0.0:
         q[6] = math.pi / 4 + turn - math.pi * math.floor(turn / math.pi + 0.5)
     else:  # the limits are not far from half a turn to both sides
-        q[6] = math.pi / 4 + turn + (0.0 if way > 0 else math.pi)
+        q[6] = math.pi / 4 + turn + (math.pi if way > 0 else 0.0)
         q[6] -= 2 * math.pi * math.floor(q[6] / (2 * math.pi) + 0.5)
     return (q >= lower).all() and (q <= upper).all()
+
+
+def facing(way: float) -> float:
+    """The finger angle against the hand's bearing from the base at which the last joint of the
+    planar solution is in its middle, rad; way as in `hand_down`."""
+    return 0.75 * math.pi + (math.pi if way > 0 else 0.0)
 
 
 @cache

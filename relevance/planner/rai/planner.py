@@ -44,7 +44,18 @@ from relevance.planner.result import (
     replayed,
 )
 from relevance.robot import ARM, HOME, LINKS, panda
-from relevance.scene import Action, Box, Goal, Phase, Pose, Scene, footprint_gap, goal_holds
+from relevance.scene import (
+    Action,
+    Box,
+    Goal,
+    Phase,
+    Pose,
+    Rectangle,
+    Region,
+    Scene,
+    footprint_gap,
+    goal_holds,
+)
 
 ROUND = 0.01
 """Corner radius of boxes against the hand, m; rai's solver needs it to slide along edges."""
@@ -181,14 +192,13 @@ def _plan(
     *early, last = rounds(everything, goal, guide, scores).allowed
     spent, end = _Spent(), config.seconds
     for allowed in early:  # these share the seconds, the last round has them whole
-        problem = rai_problem(scene, goal, movable=allowed)
-        result = _attempt(scene, goal, problem, config, spent, end)
+        result = _attempt(scene, goal, allowed, config, spent, end)
         if result.status == "solved":
             return result
         if spent.seconds.total >= end:
             break
     end = spent.seconds.total + config.seconds
-    return _attempt(scene, goal, rai_problem(scene, goal, movable=last), config, spent, end)
+    return _attempt(scene, goal, last, config, spent, end)
 
 
 class Rai:
@@ -229,23 +239,33 @@ class _Spent:
 def _attempt(
     scene: Scene,
     goal: Goal,
-    problem: RaiProblem,
+    movable: frozenset[str],
     config: RaiConfig,
     spent: _Spent,
     end: float,
 ) -> PlanResult:
-    """Run rai until it finds a plan, or has used `end` seconds in all."""
-    reason, exhausted = "", False
+    """Run rai until it finds a plan, or has used `end` seconds in all.
+
+    It looks into the rectangles of the goal region in turn, each with its share of what is left.
+    """
+    problems = [
+        rai_problem(scene, goal, movable=movable, there=there)
+        for there in _region(scene, goal).rectangles
+    ]
+    ended = {number: ("", False) for number in range(len(problems))}
     for seed in range(config.rounds):
-        left = end - spent.seconds.total
-        if left <= 0:
-            break
-        found, reason, exhausted = _run(problem, seed, left, spent)
-        if found is not None:
-            return _solved(scene, goal, problem, found, spent)
-        if reason == NO_SEQUENCE:
-            reason = "the rules allow rai no action sequence"
-            break
+        for number, problem in enumerate(problems):
+            left = (end - spent.seconds.total) / (len(problems) - number)
+            if left <= 0 or ended[number][0] == NO_SEQUENCE:
+                continue
+            found, *why = _run(problem, seed, left, spent)
+            if found is not None:
+                return _solved(scene, goal, problem, found, spent)
+            ended[number] = why[0], why[1]
+    reason = next((why for why, _ in ended.values() if why), "")
+    if reason == NO_SEQUENCE:
+        reason = "the rules allow rai no action sequence"
+    exhausted = all(exhausted for _, exhausted in ended.values())
     status = "infeasible" if exhausted else "limit"
     reason = reason or f"rai found no plan in {config.seconds:g} s"
     return PlanResult(
@@ -384,8 +404,13 @@ def _acceleration(q: np.ndarray) -> float:
     return float((np.diff(np.vstack([q[:1], q, q[-1:]]), n=2, axis=0) ** 2).sum())
 
 
-def rai_problem(scene: Scene, goal: Goal, *, movable: Collection[str]) -> RaiProblem:
-    """Write a goal in rai's formats; boxes outside `movable` stay where they are."""
+def rai_problem(
+    scene: Scene, goal: Goal, *, movable: Collection[str], there: Rectangle | None = None
+) -> RaiProblem:
+    """Write a goal in rai's formats; boxes outside `movable` stay where they are.
+
+    there: the part of the goal region that is meant (None: its first rectangle).
+    """
     ids = {box.name: f"box{i}" for i, box in enumerate(scene.objects)}
     on = goal.predicate.stacked
     parts, lines = _hand()
@@ -401,7 +426,8 @@ def rai_problem(scene: Scene, goal: Goal, *, movable: Collection[str]) -> RaiPro
         if on and box.name == goal.reference:
             facts.append("is_base")
         lines += _box(box, scene, ids, turn, facts)
-    lines.append(_target(scene, goal, ids[goal.reference], turn))
+    there = there or _region(scene, goal).rectangles[0]
+    lines.append(_target(scene, goal, there, ids[goal.reference], turn))
     pairs: dict[str, list[list[str]]] = {"hand": [], "boxes": [], "fixed": []}
     pairs["hand"] = [[part, rai_name] for rai_name in ids.values() for part in parts]
     pairs["fixed"] = [[part, "slab"] for part in parts]
@@ -512,17 +538,25 @@ def _box(
     ]
 
 
-def _target(scene: Scene, goal: Goal, reference_id: str, turn: Mapping[str, float]) -> str:
-    """The goal region as a thin plate in its support; the subject's centre must be over it."""
-    thick, angle = 0.002, 0.0
-    reference = scene[goal.reference]
+def _region(scene: Scene, goal: Goal) -> Region:
+    return goal.predicate.region(scene[goal.subject], scene[goal.reference], scene.robot)
+
+
+def _target(
+    scene: Scene, goal: Goal, there: Rectangle, reference_id: str, turn: Mapping[str, float]
+) -> str:
+    """A part of the goal region as a thin plate in its support; the subject's centre must be over
+    it."""
+    thick = 0.002
+    extent = 2 * np.array(there.half) - 2 * REGION_MARGIN
     if goal.predicate.stacked:
-        x, y, z = reference.size
-        extent = np.array([y, x] if turn[reference.name] else [x, y]) - 2 * REGION_MARGIN
-        parent, centre = reference_id, (0.0, 0.0, (z - thick) / 2)
+        reference = scene[goal.reference]
+        yaw = reference.yaw + turn[reference.name]
+        c, s = math.cos(yaw), math.sin(yaw)
+        dx, dy = there.x - reference.position[0], there.y - reference.position[1]
+        parent, angle = reference_id, there.angle - yaw
+        centre = (c * dx + s * dy, c * dy - s * dx, (reference.size[2] - thick) / 2)
     else:
-        there = goal.predicate.region(scene[goal.subject], reference, scene.robot)
-        extent = 2 * np.array(there.half) - 2 * REGION_MARGIN
         parent, centre, angle = "table", (there.x, there.y, 0.05 - thick / 2), there.angle
     size = (*np.maximum(extent, 2 * REGION_MARGIN), thick)
     return f"target ({parent}): {_shape(centre, size, 0.0005, yaw=angle, logical='{ is_target }')}"
