@@ -3,7 +3,7 @@
 The only importer of pyarrow, duckdb and webdataset.
 """
 
-from relevance.store.compacting import compact
+from relevance.store.compacting import altered, compact
 from relevance.store.dataset import Dataset
 from relevance.store.exporting import export
 from relevance.store.files import SPLITS, Files, Source, differences
@@ -47,6 +47,7 @@ __all__ = [
     "Source",
     "TableSchema",
     "absolute",
+    "altered",
     "compact",
     "copy_file",
     "decode",
