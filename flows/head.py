@@ -21,9 +21,11 @@ from prefect.artifacts import (
 )
 from prefect.cache_policies import NO_CACHE
 from prefect.events import emit_event
+from prefect.exceptions import ParameterTypeError
 from prefect.settings import get_current_settings
 from prefect.task_runners import TaskRunner
 
+from flows.parameters import ParameterError
 from flows.shards import one_by_one
 from relevance.errors import RelevanceError
 
@@ -41,9 +43,14 @@ class Stage(Flow[P, R]):
     """A flow that says in one line when its server is not there."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Run it; raises NoServer, or ParameterTypeError for parameters that cannot be."""
+        """Run it; raises NoServer, or ParameterError for parameters that cannot be."""
         find_server()
-        return super().__call__(*args, **kwargs)
+        try:
+            return super().__call__(*args, **kwargs)
+        except ParameterTypeError as error:
+            # a heading, then one line for each parameter
+            wrong = [line.removeprefix(" - ") for line in str(error).splitlines()[1:]]
+            raise ParameterError("; ".join(wrong).replace("Value error, ", "")) from None
 
 
 def find_server() -> None:

@@ -19,9 +19,9 @@ class Registry(Mapping[str, T]):
         self._items: dict[str, T] = {}
 
     def register(self, name: str, item: T) -> T:
-        """Add a variant; raises ValueError for a name that is taken."""
+        """Add a variant; raises RelevanceError for a name that is taken."""
         if name in self._items:
-            raise ValueError(f"{self.kind} {name!r} is registered already")
+            raise RelevanceError(f"{self.kind} {name!r} is registered already")
         self._items[name] = item
         return item
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -182,6 +183,25 @@ def test_a_fault_of_ours_is_a_traceback_that_says_so(
     assert FAULT not in (0, 1, 2, 120, 130)
     assert main(["--help"]) == 0
     assert f"{FAULT} a fault of relevance" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    ["raise ValueError('no user did this')", "int('no number')", "a, b = 'one'", "[].index(0)"],
+)
+def test_a_value_error_in_our_own_code_is_a_fault(
+    mistake: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import relevance.store
+
+    planted: dict[str, Any] = {"__name__": "relevance.store.queries"}
+    exec(f"def broken(path, query, *, policy):\n    {mistake}", planted)
+    monkeypatch.setattr(relevance.store, "sql", planted["broken"])
+    assert main(["sql", "none", "select 1"]) == FAULT
+    err = capsys.readouterr().err
+    assert "Traceback" in err
+    assert "ValueError" in err
+    assert "this is a fault of relevance, not of yours" in err.splitlines()[-1]
 
 
 def test_warnings_of_ours_are_one_line(

@@ -1,4 +1,4 @@
-"""The flows: their pool, a killed run, a real server with a worker."""
+"""The flows: their pool, the pipeline through them, a killed run."""
 
 from __future__ import annotations
 
@@ -7,37 +7,19 @@ import hashlib
 import json
 import os
 import signal
-import socket
 import sqlite3
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from served import FEW, ROOT, ended, environment, wait_for
 
-from flows.parameters import configured
-from flows.plugin import deployments
-from relevance.benchmarks.crashes import kill_all, members
+from flows.parameters import ParameterError, configured
+from relevance.benchmarks.crashes import members
 from relevance.errors import RelevanceError
-
-ROOT = Path(__file__).parent.parent
-BIN = Path(sys.executable).parent
-FEW = {
-    "train.same_plane": 2,
-    "train.on": 2,
-    "validation.same_plane": 2,
-    "validation.on": 2,
-    "test.same_plane": 2,
-    "test.on": 2,
-    "scenes_per_shard": 2,
-    "goals_per_scene": 1,
-}
-"""Overrides of the smoke preset: 6 shards of 2 scenes."""
-
 
 # --- the pool ----------------------------------------------------------------------------
 
@@ -151,14 +133,6 @@ def _artifacts() -> dict[str, dict[str, Any]]:
     return {item["key"]: item for item in reversed(found) if item["key"]}
 
 
-def _wait_for(what: Callable[[], Any], seconds: float, why: str) -> Any:
-    end = time.monotonic() + seconds
-    while not (found := what()):
-        assert time.monotonic() < end, f"not within {seconds:.0f} s: {why}"
-        time.sleep(0.2)
-    return found
-
-
 @pytest.fixture(scope="module")
 def dataset(prefect_server: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny dataset, generated and labelled by the flows on two processes."""
@@ -219,7 +193,7 @@ def test_flows_leave_artifacts_and_events(dataset: Path) -> None:
         found = [e for e in events() if e["payload"]["dataset"] == str(dataset)]
         return {e["resource"]["relevance.table"]: e["payload"]["shards"] for e in found}
 
-    _wait_for(lambda: len(ours()) == 2, 30, "two events")
+    wait_for(lambda: len(ours()) == 2, 30, "two events")
     assert ours() == {"scenes": 6, "labels": 15}
 
 
@@ -275,14 +249,19 @@ def test_another_policy_is_a_parameter(dataset: Path) -> None:
         label(dataset=str(dataset), policy="guess")
 
 
-def test_a_cluster_is_an_address(prefect_server: None, tmp_path: Path) -> None:
-    from prefect.exceptions import ParameterTypeError
-
+def test_parameters_that_cannot_be_are_one_line(prefect_server: None, tmp_path: Path) -> None:
     from flows.generate import generate
 
-    with pytest.raises(ParameterTypeError, match="the address of a Dask scheduler"):
-        generate(dataset=str(tmp_path / "new"), preset="smoke", cluster="somewhere")
+    with pytest.raises(ParameterError) as wrong:
+        generate(dataset=str(tmp_path / "new"), preset="smoke", cluster="x", max_workers=0)
+    assert str(wrong.value) == (
+        "max_workers: Input should be greater than or equal to 1; "
+        "cluster: expected the address of a Dask scheduler, like tcp://10.0.0.1:8786"
+    )
     assert not (tmp_path / "new").exists()
+    (tmp_path / "file").touch()
+    with pytest.raises(ParameterError, match=r"^dataset: \S+/file is a file, expected the path"):
+        generate(dataset=str(tmp_path / "file"), preset="smoke")
 
 
 def test_retrain_trains_evaluates_and_then_rests(dataset: Path) -> None:
@@ -364,29 +343,14 @@ def home(prefect_server: None, tmp_path: Path) -> Path:
     return tmp_path / "home"
 
 
-def _environment(home: Path) -> dict[str, str]:
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT")}
-    return kept | {"PREFECT_HOME": str(home), "OMP_NUM_THREADS": "1"}
-
-
 def _generate(root: Path, home: Path) -> subprocess.Popen[bytes]:
     call = f"generate(dataset={str(root)!r}, preset='smoke', overrides={MORE}, max_workers=2)"
     return subprocess.Popen(
         [sys.executable, "-c", f"from flows.generate import generate\n{call}"],
         cwd=ROOT,
-        env=_environment(home),
+        env=environment(home),
         start_new_session=True,
     )
-
-
-@contextmanager
-def _ended(process: subprocess.Popen[Any]) -> Iterator[subprocess.Popen[Any]]:
-    """Whatever happens, nothing of the process's session is left."""
-    try:
-        yield process
-    finally:
-        kill_all(process.pid)
-        process.wait(30)
 
 
 def test_a_killed_flow_leaves_nobody_behind_and_resumes_to_the_same_bytes(
@@ -396,11 +360,11 @@ def test_a_killed_flow_leaves_nobody_behind_and_resumes_to_the_same_bytes(
     from relevance.pipeline import DatasetConfig, finish, generate_shard, prepare
 
     calm, killed = tmp_path / "calm", tmp_path / "killed"
-    with _ended(_generate(killed, home)) as process:
-        _wait_for(lambda: [*killed.glob("scenes/*/*.parquet")], 240, "a first shard")
+    with ended(_generate(killed, home)) as process:
+        wait_for(lambda: [*killed.glob("scenes/*/*.parquet")], 240, "a first shard")
         process.kill()
         process.wait(30)
-        _wait_for(lambda: not members(process.pid), 60, "the end of its workers and server")
+        wait_for(lambda: not members(process.pid), 60, "the end of its workers and server")
     before = {file: file.stat().st_mtime_ns for file in killed.glob("scenes/*/*.parquet")}
     assert 0 < len(before) < 20
 
@@ -430,124 +394,12 @@ def test_a_flow_ends_with_its_server(home: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", program],
         cwd=ROOT,
-        env=_environment(home),
+        env=environment(home),
         start_new_session=True,
         stderr=subprocess.PIPE,
         text=True,
     )
-    with _ended(process):
+    with ended(process):
         _, errors = process.communicate(timeout=120)  # Prefect alone takes four minutes
         assert process.returncode == 1
         assert "the flow's Prefect server died; start the flow again" in errors
-
-
-# --- a server, a worker, deployments -------------------------------------------------------
-
-
-def _prefect(*arguments: str, env: dict[str, str], timeout: float = 240) -> str:
-    done = subprocess.run(
-        [BIN / "prefect", *arguments],
-        cwd=ROOT,
-        env=env,
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
-def _background(log: Path, *arguments: str, env: dict[str, str]) -> subprocess.Popen[bytes]:
-    with log.open("wb") as stream:
-        return subprocess.Popen(
-            [BIN / "prefect", *arguments],
-            cwd=ROOT,
-            env=env,
-            start_new_session=True,
-            stdout=stream,
-            stderr=subprocess.STDOUT,
-        )
-
-
-@pytest.mark.slow
-def test_deployments_schedule_and_trigger_on_a_real_server(tmp_path: Path) -> None:
-    import httpx
-
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    api = f"http://127.0.0.1:{port}/api"
-    env = _environment(tmp_path / "home") | {"PREFECT_API_URL": api}
-    data = tmp_path / "dataset"
-
-    def post(path: str, **body: Any) -> Any:
-        answer = httpx.post(f"{api}{path}", json=body, timeout=30)
-        answer.raise_for_status()
-        return answer.json()
-
-    def healthy() -> bool:
-        with contextlib.suppress(httpx.TransportError):
-            return httpx.get(f"{api}/health", timeout=5).status_code == 200
-        return False
-
-    server = _background(
-        tmp_path / "server.log",
-        *("server", "start", "--host", "127.0.0.1", "--port", str(port)),
-        env=env,
-    )
-    with _ended(server):
-        _wait_for(healthy, 180, "a healthy server")
-        _prefect("work-pool", "create", "relevance", "--type", "process", env=env)
-        _prefect("--no-prompt", "deploy", "--all", env=env)
-        there = {item["name"]: item for item in post("/deployments/filter")}
-        assert set(there) == set(deployments())
-        assert [s["schedule"]["cron"] for s in there["retrain"]["schedules"]] == ["0 3 * * *"]
-        [automation] = post("/automations/filter")
-        assert automation["trigger"]["expect"] == ["shards.written"]
-
-        refused = subprocess.run(
-            [BIN / "prefect", "deployment", "run", "generate", "-p", "preset=huge"],
-            cwd=ROOT,
-            env=env,
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=False,
-        )
-        assert refused.returncode != 0
-        assert "huge" in refused.stdout + refused.stderr
-
-        arguments = ("worker", "start", "--pool", "relevance")
-        with _ended(_background(tmp_path / "worker.log", *arguments, env=env)):
-            watch = ("--watch", "--watch-timeout", "240")
-            out = _prefect(
-                *("deployment", "run", "generate", *watch, "-p", f"dataset={data}"),
-                *("-p", "preset=smoke", "-p", f"overrides={json.dumps(FEW)}"),
-                env=env,
-                timeout=300,
-            )
-            assert "finished successfully" in out
-            assert len([*data.glob("scenes/*/*.parquet")]) == 6
-            # Scenes alone do not train; labels do, and the full name works too.
-            name = {"deployments": {"name": {"any_": ["retrain"]}}}
-            runs = {"flow_runs": {"state": {"type": {"any_": ["SCHEDULED"]}}}}
-            planned = len(post("/flow_runs/filter", **name, **runs))
-            _prefect(
-                *("deployment", "run", "label/label", *watch, "-p", f"dataset={data}"),
-                env=env,
-                timeout=300,
-            )
-
-            def triggered() -> list[dict[str, Any]]:
-                found = post("/flow_runs/filter", **name, sort="EXPECTED_START_TIME_ASC")
-                return [run for run in found if run["parameters"].get("dataset") == str(data)]
-
-            [run] = _wait_for(triggered, 120, "a run of retrain")
-            assert planned >= 1, "the cron schedule plans runs ahead"
-            # That run trains for minutes; it has been started, which is what we wanted to see.
-            httpx.post(
-                f"{api}/flow_runs/{run['id']}/set_state",
-                json={"state": {"type": "CANCELLED"}, "force": True},
-                timeout=30,
-            ).raise_for_status()

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from relevance.pipeline import (
     finish,
     generate_shard,
     label_shard,
+    load_config,
     prepare,
 )
 from relevance.pipeline.checking import check
@@ -152,6 +154,26 @@ def test_an_object_appears_whole_or_not_at_all(bucket: str) -> None:
         assert not path.exists()
     assert path.read_bytes() == b"whole"
     assert [item.name for item in path.parent.iterdir()] == ["file.bin"]
+
+
+def test_one_of_two_writers_makes_a_dataset_there(
+    bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = f"{bucket}/race"
+    files: Any = locate(root)
+    write = files.fs.pipe_file
+
+    def late(*args: Any, **more: Any) -> Any:
+        """The other writer comes between this one's look and its writing."""
+        monkeypatch.setattr(files.fs, "pipe_file", write)
+        prepare(root, replace(CONFIG, seed=1))
+        return write(*args, **more)
+
+    monkeypatch.setattr(files.fs, "pipe_file", late)
+    with pytest.raises(DatasetError, match=r"config\.seed: the dataset was made with 1, found 0"):
+        prepare(root, CONFIG)
+    assert load_config(Dataset.open(root)).seed == 1
+    assert prepare(root, replace(CONFIG, seed=1)) == prepare(root, replace(CONFIG, seed=1))
 
 
 def test_a_bucket_without_a_dataset_is_named(bucket: str) -> None:

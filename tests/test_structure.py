@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -114,6 +116,17 @@ def test_circles_are_seen_within_a_room_and_inside_functions(tmp_path: Path) -> 
     assert {*found} == {f"relevance.store.{name}" for name in "abc"}
 
 
+def test_what_people_get_wrong_is_a_relevance_error() -> None:
+    """A plain ValueError is a fault of ours, but for validators: pydantic turns it into one."""
+    plain = [
+        str(file.relative_to(ROOT))
+        for file in sources(ROOT)
+        if "raise ValueError" in file.read_text()
+        and "pydantic" not in {room_of(name) for _, name in imports(file, ROOT)}
+    ]
+    assert plain == []
+
+
 def test_drawing_and_map_are_of_this_house() -> None:
     """`make drawing` writes them anew."""
     text = (ROOT / "CONTRIBUTING.md").read_text()
@@ -128,6 +141,36 @@ def test_importing_the_package_is_light() -> None:
     ).stdout.split()
     assert "relevance" in loaded
     assert not set(DOORS) & set(loaded)
+
+
+def test_tensor_shapes_are_explained() -> None:
+    """In the rooms of tensors every letter of a shape is in the legend of its file."""
+    lacking = {
+        str(file.relative_to(ROOT)): letters
+        for file in sources(ROOT)
+        if room_of(module_of(file, ROOT)) in DOORS["torch"]
+        if (letters := unexplained(file.read_text()))
+    }
+    assert lacking == {}
+
+
+def unexplained(text: str) -> set[str]:
+    """Letters of `x_BND` and of shapes like (B, N, 3) that `Shape suffixes:` does not name."""
+    tree = ast.parse(text)
+    named = {letter for name in re.findall(r"\b[a-z]\w*_([A-Z0-9]+)\b", text) for letter in name}
+    said = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)]
+    for shape in re.findall(r"\((?:\w+|\.\.\.)(?:, ?[\w .]*)+\)", "\n".join(map(str, said))):
+        named |= {*re.findall(r"\b[A-Z]\b", shape)}
+    legend = (ast.get_docstring(tree) or "").partition("Shape suffixes:")[2].partition("\n\n")[0]
+    return {letter for letter in named if letter.isalpha()} - {*re.findall(r"\b[A-Z]\b", legend)}
+
+
+def test_a_shape_without_legend_is_seen() -> None:
+    legend = '''"""Layers.\n\nShape suffixes: B scenes, N objects.\n\nD is said too late."""\n'''
+    assert unexplained("x_BN = 1\ny = MAX_EDGE\n") == {"B", "N"}
+    assert unexplained(f"{legend}x_BN3 = 1\n") == set()
+    assert unexplained(f"{legend}x_BND = 1\n") == {"D"}
+    assert unexplained(f'{legend}def f():\n    """Scores (B, T, 3)."""\n') == {"T"}
 
 
 def test_modules_stay_short() -> None:

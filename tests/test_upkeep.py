@@ -413,9 +413,24 @@ def test_gathered_labels_answer_the_same_until_the_shards_change(made: Path) -> 
     assert {file.parts[-7] for file in gathered} == {"policy=found"}
     assert [sql(made, query) for query in queries] == before
     assert check(made, render=False) == []
-    # what is not whole is not read
+    # a byte that changed, size and time as before
+    whole, times = gathered[0].read_bytes(), gathered[0].stat()
+    middle = len(whole) // 2
+    gathered[0].write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+    os.utime(gathered[0], ns=(times.st_atime_ns, times.st_mtime_ns))
+    [breach] = check(made, render=False)
+    assert breach.file == str(gathered[0].relative_to(made))
+    assert "the file was changed after it was written" in breach.message
+    done(*missing(made, [breach.file]))
+    assert check(made, render=False) == []
+    assert [sql(made, query) for query in queries] == before
+    # what is not whole is not read, and is named
+    gathered = sorted((made / "compacted").rglob("*.parquet"))
     gathered[0].unlink()
     assert [sql(made, query) for query in queries] == before
+    assert [breach.file for breach in check(made, render=False)] == [
+        str(gathered[0].relative_to(made))
+    ]
 
 
 def test_export_loads_with_datasets(made: Path, tmp_path: Path) -> None:

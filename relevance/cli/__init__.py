@@ -24,7 +24,7 @@ import tyro
 from relevance.cli.arguments import Command
 from relevance.cli.commands import COMMANDS
 from relevance.cli.terminal import UsageError, say
-from relevance.errors import RelevanceWarning
+from relevance.errors import RelevanceError, RelevanceWarning
 
 FAULT = 70
 """Exit code of a fault of this project (EX_SOFTWARE of sysexits.h)."""
@@ -53,12 +53,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if _nobody_reads():  # `relevance sql ... | head`
             return 0
         return _refuse(name, error)
-    except (OSError, ValueError) as error:
+    except (OSError, RelevanceError) as error:
         if isinstance(error, OSError):
             _drop_output()
-        if isinstance(error, OSError) or _ours(error):
-            return _refuse(name, error)
-        return _report()
+        return _refuse(name, error)
     except Exception:
         return _report()
 
@@ -140,17 +138,6 @@ def _help(commands: Mapping[str, Command] = COMMANDS) -> str:
 
 
 # --- what becomes of an error ------------------------------------------------------------
-
-
-def _ours(error: BaseException) -> bool:
-    """Whether this project raised it, rather than a library that met a mistake of ours."""
-    packages = ("relevance.", "flows.")
-    if type(error).__module__.startswith(packages):
-        return True
-    trace, module = error.__traceback__, ""
-    while trace is not None:
-        module, trace = trace.tb_frame.f_globals.get("__name__", ""), trace.tb_next
-    return f"{module}.".startswith(packages)
 
 
 def _refuse(name: str, error: Exception) -> int:

@@ -1,11 +1,12 @@
 """Arguments that several subcommands take, and what all commands are described by."""
 
+import dataclasses
 import math
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
@@ -49,6 +50,12 @@ def at_least(flag: str, value: float | None, least: float, most: float = math.in
 def check_workers(workers: int) -> None:
     """UsageError unless that many processes can be had."""
     at_least("--workers", workers, 1, MOST_WORKERS)
+
+
+def settings_of(kind: type[Any], **given: Any) -> Any:
+    """A config of those of the given settings that its class has."""
+    known = {field.name for field in dataclasses.fields(kind)}
+    return kind(**{name: value for name, value in given.items() if name in known})
 
 
 def one_of(flag: str, value: str | None, known: Iterable[str]) -> None:

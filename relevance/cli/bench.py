@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from relevance.cli.arguments import OptionalName, settings_of
 from relevance.cli.terminal import UsageError, bar, say, show, to_json
 
 Part = Literal["speed", "truth", "stability", "searches", "scaling", "completeness"]
@@ -44,7 +45,7 @@ def bench_planner(_: Any) -> Callable[..., int]:
         out: OptionalPath = None,
         parts: Parts = None,
         scenes: Scenes = "ours",
-        against: Literal["rai"] | None = None,
+        against: OptionalName = None,
         unsolved: Count = 0,
         limit: Seconds = 30.0,
         versus: OptionalCheckout = None,
@@ -65,10 +66,11 @@ def bench_planner(_: Any) -> Callable[..., int]:
                 only that).
             scenes: How the scenes are drawn: by our sampler, or boxes thrown anywhere within
                 reach, as other people make them (scaling and growth: always ours).
-            against: Another planner that takes turns with ours on the same tasks.
+            against: Another planner that takes turns with ours on the same tasks: rai, or any other
+                that is registered (relevance.planner.PLANNERS).
             unsolved: With --against: how many tasks that ours leaves unsolved the other is asked
                 besides, two at a time (at most 100 times as many are drawn for it).
-            limit: CPU seconds that the other planner has for a task.
+            limit: CPU seconds that the other planner has for a task, where it has such a limit.
             versus: Folder of another checkout of this project, whose planner takes turns with
                 this one on the same tasks, and on a tenth as many of 30 boxes.
         """
@@ -79,9 +81,9 @@ def bench_planner(_: Any) -> Callable[..., int]:
         _require("--limit", limit, 0 < limit < math.inf, "a number over 0")
         seed = secrets.randbits(32) if seed is None else seed
         if against:
-            from relevance.planner.rai.planner import require_rai
+            from relevance.planner import PLANNERS
 
-            require_rai()
+            PLANNERS[against].require()
         chosen = parts if parts is not None else () if against or versus else PARTS
         folder = out or Path("data/bench") / f"planner-{seed}"
         try:
@@ -128,8 +130,11 @@ def _against(
 ) -> Iterator[tuple[str, Work]]:
     """Ours and another planner."""
     from relevance import benchmarks
-    from relevance.planner.rai.planner import RaiConfig, plan_rai
+    from relevance.planner import PLANNERS
 
+    peer = PLANNERS[name]
+    peer.warm_up()
+    config = settings_of(peer.Config, seconds=limit)
     drawn = benchmarks.draw(tasks, seed, scenes=scenes)
     _write_scenes(folder / "scenes.jsonl", drawn)
     hard: list[Any] = []
@@ -143,7 +148,7 @@ def _against(
         f"ours and {name}",
         lambda progress: benchmarks.measure_against(
             drawn,
-            functools.partial(plan_rai, config=RaiConfig(seconds=limit), replay=False),
+            functools.partial(peer.plan, config=config, replay=False),
             name=name,
             unsolved=hard,
             processes=2,

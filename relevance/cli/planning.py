@@ -1,7 +1,6 @@
 """The subcommand `plan`."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
-import dataclasses
 import math
 import os
 import sys
@@ -11,7 +10,7 @@ from typing import Annotated, Any, Literal, cast
 
 import tyro
 
-from relevance.cli.arguments import Command, OptionalPath, Preset, at_least, one_of
+from relevance.cli.arguments import Command, OptionalPath, Preset, at_least, one_of, settings_of
 from relevance.cli.terminal import UsageError, bar, to_json
 
 Name = Annotated[str, tyro.conf.arg(metavar="NAME")]
@@ -71,14 +70,13 @@ def _plan(_: Preset) -> Callable[..., int]:
             raise UsageError("--guide and --checkpoint go together: a guide needs a model")
         chosen = PLANNERS[planner]
         chosen.require()
-        given = {
-            "search": search,
-            "node_limit": limit,
-            "max_actions": max_actions,
-            "seconds": seconds,
-        }
-        settings = {field.name for field in dataclasses.fields(chosen.Config)}
-        config = chosen.Config(**{k: v for k, v in given.items() if k in settings})
+        config = settings_of(
+            chosen.Config,
+            search=search,
+            node_limit=limit,
+            max_actions=max_actions,
+            seconds=seconds,
+        )
         file = Path("/dev/stdin") if str(scenes) == "-" else scenes
         tasks = [
             (scene, scene.goal(text))

@@ -1,6 +1,8 @@
 """What a checkpoint says of every labelled object: scored into rows, and read back as columns.
 
 Judged by the labels of the policy that the checkpoint learned, as they are when they are read.
+
+Shape suffixes: R rows of predictions.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 What was seen is kept by what the scene shows (boxes, table, camera, light), never by the
 scene's id, which its author chooses.
+
+Shape suffixes: G goals, N objects of the scene, H and W height and width in pixels.
 """
 
 from __future__ import annotations

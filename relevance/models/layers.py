@@ -1,6 +1,7 @@
 """Layers that more than one body is made of.
 
-Shape suffixes: B scenes, N objects (padded), G goals, T trios, L tokens, D width.
+Shape suffixes: B scenes, N objects (padded), G goals, T trios, L tokens, D width,
+C channels.
 """
 
 from __future__ import annotations

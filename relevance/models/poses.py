@@ -2,7 +2,7 @@
 
 Geometry is in decimetres, so that its numbers are near 1.
 
-Shape suffixes: none here; GEOMETRY is the last axis of whatever comes in.
+Shape suffixes: N objects of a scene; GEOMETRY is the last axis of whatever comes in.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ What a dense layer makes of the four feature vectors (scene, subject, reference,
 nobody's alone: it is made anew for each query, the vectors themselves are not.
 
 Shape suffixes: B scenes, N objects (padded), G goals, T trios of subject, reference and query,
-C channels, D width.
+C channels, D width, E = 3 D: the three embeddings of a trio.
 """
 
 from __future__ import annotations

@@ -29,7 +29,15 @@ from relevance.scene import (
     scene_from_json,
 )
 from relevance.simulation import Renderer
-from relevance.store import MEMBERS, SCHEMAS, TABLES, Dataset, DatasetError, table_schema
+from relevance.store import (
+    MEMBERS,
+    SCHEMAS,
+    TABLES,
+    Dataset,
+    DatasetError,
+    altered,
+    table_schema,
+)
 
 PER_RULE = 20
 """Breaches of one rule that are listed; the rest is counted."""
@@ -73,7 +81,8 @@ def check(
     if dataset.sources:
         return _merged(dataset, render, strict, progress)
     breaches = list(_description(dataset))
-    breaches += [Breach(file=file, message=message) for file, message in integrity(dataset)]
+    found = (*integrity(dataset), *altered(dataset))
+    breaches += [Breach(file=file, message=message) for file, message in found]
     files = [file for table in TABLES for file in dataset.files(table)]
     files += dataset.files_beside()
     unreadable: set[Path] = set()

@@ -40,6 +40,7 @@ from relevance.store import (
     DatasetError,
     Labelling,
     copy_file,
+    create_object,
     differences,
     is_remote,
     locate,
@@ -164,12 +165,11 @@ def _differs(there: Dataset, key: str, found: Any, now: Any, hint: str) -> Datas
 
 def _create(root: Path, description: Mapping[str, Any]) -> bool:
     """Write dataset.json unless another process was first, whose dataset it is then."""
+    text = json.dumps(description, indent=2, sort_keys=True) + "\n"
     if is_remote(root):
-        Dataset.create(root, description)
-        return True
+        return create_object(root / "dataset.json", text.encode())
     owner = f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}"
     draft = root / f".dataset.json.{owner}.tmp"  # `sweep` removes it when this process dies
-    text = json.dumps(description, indent=2, sort_keys=True) + "\n"
     try:
         root.mkdir(parents=True, exist_ok=True)
         draft.write_text(text, encoding="utf-8")

@@ -22,6 +22,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from relevance.errors import RelevanceError
 from relevance.robot import panda_urdf
 from relevance.scene import CONTACT_TOLERANCE, Goal, Phase, Scene, goal_holds
 from relevance.simulation.bullet import pybullet
@@ -69,7 +70,7 @@ def replay(scene: Scene, goal: Goal, phases: Sequence[Phase], *, substeps: int =
     Raises SceneError when the goal names no object of the scene.
     """
     if substeps < 1:
-        raise ValueError(f"substeps = {substeps}: expected at least 1")
+        raise RelevanceError(f"substeps = {substeps}: expected at least 1")
     return _Run(_arena(os.getpid()), scene).judge(scene.goal(goal), phases, substeps)
 
 

@@ -3,7 +3,7 @@
 The only importer of pyarrow, duckdb and webdataset.
 """
 
-from relevance.store.compacting import compact
+from relevance.store.compacting import altered, compact
 from relevance.store.dataset import Dataset
 from relevance.store.exporting import export
 from relevance.store.files import SPLITS, Files, Source, differences
@@ -14,6 +14,7 @@ from relevance.store.paths import (
     DatasetError,
     absolute,
     copy_file,
+    create_object,
     file_hash,
     is_remote,
     locate,
@@ -47,8 +48,10 @@ __all__ = [
     "Source",
     "TableSchema",
     "absolute",
+    "altered",
     "compact",
     "copy_file",
+    "create_object",
     "decode",
     "differences",
     "empty_size",

@@ -4,7 +4,9 @@ Rows are put into one file for each value of the flags that label queries ask fo
 the table's schema), and a view says each file's values as constants: counting by them reads no
 row at all. The shards stay what counts; the gathered files are a copy that queries use as long
 as its manifest names exactly the shards that are there, by name and hash, and the gathered files
-are those that were written. Anything else, and queries read the shards again.
+are those that were written. Anything else, and queries read the shards again. That a file is as
+it was written they see by its size and time of change; `relevance check` reads its bytes (see
+`altered`).
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -100,30 +102,49 @@ def _emptied(folder: Path) -> Iterator[Path]:
 
 def fresh(dataset: Files, table: str) -> str | None:
     """A SELECT over the gathered files of a table; None unless they are those of today's shards."""
+    written = _written(dataset, table)
+    for file, (*state, digest) in written.items():
+        if not file.is_file() or (_state(file) != state and file_hash(file) != digest):
+            return None
+    schema = table_schema(table)
+    parts = []
+    for folder, files in groupby(sorted(written), key=lambda file: file.parent):
+        said = keys_of(folder.relative_to(dataset.path) / "x")
+        constants = {key: literal(said[key]) for key in (*KEYS, *schema.gathered)}
+        parts.append(f"SELECT {columns(schema, None, constants)} FROM {reading(files)}")
+    return " UNION ALL ".join(parts) or None
+
+
+def altered(dataset: Files) -> Iterator[tuple[str, str]]:
+    """(file, message) of gathered files of today's shards whose bytes are not those written."""
+    for table in TABLES:
+        for file, (*_, digest) in _written(dataset, table).items():
+            found = file_hash(file) if file.is_file() else "none"
+            if found != digest:
+                yield (
+                    dataset.name_of(file),
+                    f"content hash: expected {digest[:16]}, found {found[:16]}; the file was "
+                    "changed after it was written (`relevance compact` makes it anew)",
+                )
+
+
+def _written(dataset: Files, table: str) -> dict[Path, list[Any]]:
+    """The gathered files of a table: size, time of change and hash as they were written.
+
+    None at all when there is half a copy, or one of another age or of other shards.
+    """
     schema = table_schema(table)
     manifest = dataset.path / FOLDER / f"{table}.json"
     if not schema.gathered or is_remote(dataset.path) or not manifest.is_file():
-        return None
-    try:
+        return {}
+    with suppress(OSError, ValueError, KeyError, TypeError):
         listed = json.loads(manifest.read_text(encoding="utf-8"))
-        folder = manifest.parent / listed["folder"]
-        known = listed["version"] == schema.version and bool(listed["files"])
-        if not known or listed["shards"] != _shards(dataset, table):
-            return None
-        for name, (size, changed, digest) in listed["files"].items():
-            file = folder / name
-            if _state(file) != [size, changed] and file_hash(file) != digest:
-                return None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None  # half a copy, or one of another age: the shards are read
-    keys = (*KEYS, *schema.gathered)
-    parts = []
-    for place, names in groupby(sorted(listed["files"]), key=lambda name: Path(name).parent):
-        said = keys_of(place / "x")
-        constants = {key: literal(said[key]) for key in keys}
-        files = [folder / name for name in names]
-        parts.append(f"SELECT {columns(schema, None, constants)} FROM {reading(files)}")
-    return " UNION ALL ".join(parts)
+        folder, files = manifest.parent / listed["folder"], listed["files"]
+        if listed["version"] == schema.version and listed["shards"] == _shards(dataset, table):
+            return {
+                folder / name: [size, time, digest] for name, (size, time, digest) in files.items()
+            }
+    return {}
 
 
 def _shards(dataset: Files, table: str) -> dict[str, str | None]:

@@ -134,6 +134,21 @@ def writing(path: Path, *touched: Path) -> Iterator[None]:
         raise DatasetError(f"{path}: cannot be written ({reason})") from None
 
 
+def create_object(path: Path, content: bytes) -> bool:
+    """Write an object of a store unless there is one; whether it was written.
+
+    One PUT on the condition that nothing is there (`If-None-Match: *`), which S3, MinIO and
+    others keep; a store that does not know it overwrites, and two writers must not start at once.
+    """
+    try:
+        filesystem(path).pipe_file(cast(Any, path).path, content, mode="create")
+    except OSError:
+        if path.exists():
+            return False
+        raise
+    return True
+
+
 def copy_file(source: Path, target: Path) -> None:
     """Copy a file within a dataset; the target exists whole or not at all."""
     if is_remote(source):
