@@ -142,14 +142,15 @@ def test_a_home_that_cannot_be_written_is_no_obstacle(scene: Path, tmp_path: Pat
 
 
 def test_the_cache_moves_when_the_home_cannot_be_written(tmp_path: Path) -> None:
-    program = "import os, relevance; print(os.environ['NUMBA_CACHE_DIR'])"
+    program = "import os, relevance, matplotlib; print(os.environ['NUMBA_CACHE_DIR'])"
     done = _shell(
-        f'unset XDG_CACHE_HOME NUMBA_CACHE_DIR; {sys.executable} -c "{program}"',
+        f'unset XDG_CACHE_HOME NUMBA_CACHE_DIR MPLCONFIGDIR; {sys.executable} -c "{program}"',
         HOME="/dev/null",
         TMPDIR=str(tmp_path),
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(str(tmp_path))
+    assert done.stderr == ""
 
 
 def test_a_port_in_use_is_named(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -244,9 +245,14 @@ def test_what_makes_an_answer_doubtful_is_shown() -> None:
     line = {"id": "s", "goal": "on(a, b)", "reason": "", "seconds": 0.1, "counts": {"nodes": 3}}
     line |= {"actions": [["pick", "a"]], "replay": {"ok": True}, "ambiguous": True}
     assert plan_text(line | {"status": "solved"}).splitlines()[0].endswith("replayed, ambiguous")
-    lost = line | {"status": "infeasible", "reason": "no room", "blocking": "c", "actions": []}
+    lost = line | {
+        "status": "infeasible",
+        "reason": "no room",
+        "blocking": ("c", "d"),
+        "actions": [],
+    }
     assert plan_text(lost) == (
-        "s  on(a, b): infeasible (no room), blocked by c, 3 nodes, ambiguous"
+        "s  on(a, b): infeasible (no room), blocked by c, d, 3 nodes, ambiguous"
     )
 
 

@@ -145,7 +145,7 @@ def plan_text(line: Mapping[str, Any]) -> str:
         replayed = ["replayed"] if line["replay"] else []
         head += ", ".join([f"solved in {line['seconds']:.3f} s", *replayed, *notes])
     else:
-        blocking = [f"blocked by {line['blocking']}"] if line.get("blocking") else []
+        blocking = [f"blocked by {', '.join(line['blocking'])}"] if line.get("blocking") else []
         found = [f"{line['status']} ({line['reason']})", *blocking]
         head += ", ".join([*found, f"{line['counts']['nodes']} nodes", *notes])
     steps = [f"  {i}. {' '.join(action)}" for i, action in enumerate(line["actions"], 1)]
