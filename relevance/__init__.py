@@ -44,6 +44,8 @@ def _caches() -> Path:
                 folder != own or folder.stat().st_uid == os.getuid()
             ):
                 os.environ["XDG_CACHE_HOME"] = str(folder)
+                if folder == own:  # else matplotlib complains of the home in two lines of its own
+                    os.environ.setdefault("MPLCONFIGDIR", str(folder / "matplotlib"))
                 return folder
     os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="relevance-cache-")
     return Path(os.environ["XDG_CACHE_HOME"])

@@ -302,8 +302,9 @@ def test_a_camera_that_randomised_scenes_have_and_distinct_boxes_are_not_warned_
 def test_boxes_that_look_the_same_are_named() -> None:
     far = replace(BLOCKED["far"], size=BLOCKED["red"].size, color=BLOCKED["red"].color)
     alike = replace(BLOCKED, objects=(*BLOCKED.objects[:-1], far))
-    with pytest.warns(RelevanceWarning, match="red, far look the same"):
+    with pytest.warns(RelevanceWarning, match="red, far look the same") as told:
         NetworkScorer(small_model()).scores(alike, GOAL)
+    assert len(told) == 1
 
 
 def test_broken_weights_and_a_beta_that_is_no_number_are_refused() -> None:

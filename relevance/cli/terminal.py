@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import json
 import math
 import sys
@@ -52,23 +51,12 @@ def to_json(value: Any) -> str:
     return json.dumps(strict(value), default=str, allow_nan=False)
 
 
-def distinct(columns: Sequence[str]) -> list[str]:
-    """The names, with _1, _2, ... at the end of one that was there before."""
-    names: list[str] = []
-    for column in columns:
-        numbered = (f"{column}_{number}" for number in itertools.count(1))
-        taken = {*names, *(columns if column in names else ())}  # `a_1` may be a name itself
-        names.append(next(n for n in itertools.chain([column], numbered) if n not in taken))
-    return names
-
-
 def show(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], format: Format, title: str | None = None
 ) -> None:
     """Print rows: a table, one JSON list of objects, or CSV with a header."""
     if format == "json":
-        names = distinct(columns)
-        print(to_json([dict(zip(names, row, strict=True)) for row in rows]))
+        print(to_json([dict(zip(columns, row, strict=True)) for row in rows]))
     elif format == "csv":
         writer = csv.writer(sys.stdout, lineterminator="\n")
         writer.writerow(columns)

@@ -57,7 +57,7 @@ class NetworkScorer:
         """CPU seconds of the last `scores`, a needed encoding included, rendering left out."""
         self._seen: OrderedDict[Hashable, tuple[np.ndarray, np.ndarray]] = OrderedDict()
         self._encodings: OrderedDict[Hashable, Any] = OrderedDict()
-        self._warned: set[Camera] = set()
+        self._warned: set[Hashable] = set()
 
     def observe(self, scene: Scene, image: np.ndarray, views: np.ndarray) -> None:
         """Give a scene's image (H, W, 3) and its objects' views (N, 32, 32, 3), uint8 RGB."""
@@ -143,8 +143,9 @@ class NetworkScorer:
                 f"scene {scene.id}: its camera ({_pose(its)}) is not the one that the model was "
                 f"trained with ({_pose(mine)}); its scores may mean nothing"
             )
-        if shown(scene) not in self._seen:
+        if shown(scene) not in self._seen and shown(scene) not in self._warned:
             for names in lookalikes(scene):
+                self._warned.add(shown(scene))  # the picture is not kept yet when it is asked for
                 warn(
                     f"scene {scene.id}: {', '.join(names)} look the same, so that the network "
                     "cannot tell them apart; give them other colours or sizes"

@@ -95,11 +95,6 @@ class Estimate:
     config_hash: str
     """Of the settings that it is for."""
 
-    @property
-    def wall_hours(self) -> float:
-        """Hours from start to end."""
-        return self.quantities.hours / self.workers
-
     def write(self, root: str | Path) -> None:
         """Keep it beside the dataset, to be compared with what came of it."""
         with replacing(locate(root) / FILE) as temporary:

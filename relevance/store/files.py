@@ -233,10 +233,6 @@ class Files:
         """What a file's footer says: table, version, sha256 and what `made_by` gave."""
         return read_footer(table_schema(self.table_of(file)), file)
 
-    def outdated(self, file: Path) -> bool:
-        """Whether a file is of an older version than its schema; its younger columns are null."""
-        return int(self.metadata(file)["version"]) < table_schema(self.table_of(file)).version
-
     # labellings -------------------------------------------------------------------------------
 
     @property
