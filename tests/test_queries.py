@@ -125,7 +125,14 @@ def test_plain_duckdb_gives_the_same(dataset: Dataset, tmp_path: Path) -> None:
                     plain.execute(statement)
         assert made == {*TABLES, *(f"beside_{table}" for table in ("plans", "timings", "labels"))}
         views = (SCHEMAS / "views.sql").read_text()
-        for name in ("objects", "label_balance", "visibility", "scene_sizes", "split_overlap"):
+        for name in (
+            "objects",
+            "shard_families",
+            "label_balance",
+            "visibility",
+            "scene_sizes",
+            "split_overlap",
+        ):
             query = re.search(rf"CREATE OR REPLACE VIEW {name} .*?;\n", views, re.DOTALL)
             assert query is not None
             plain.execute(query[0])
@@ -233,6 +240,19 @@ def test_one_broken_file_stops_only_who_needs_it(dataset: Dataset) -> None:
     with pytest.raises(DatasetError, match=said) as caught:
         sql(dataset.path, "FROM plans")
     assert "\n" not in str(caught.value)
+    for query in (
+        "FROM plan_failures",
+        "FROM label_changes",
+        "FROM scenes JOIN plans USING (split)",
+    ):
+        with pytest.raises(DatasetError, match=said):
+            sql(dataset.path, query)
+    for query, rows in {
+        "SELECT count(*) FROM Scenes": 8,
+        "WITH a AS (FROM labels) SELECT count(*) FROM a JOIN scenes USING (scene_id)": 24,
+        "SELECT count(*) FROM objects SEMI JOIN labels USING (scene_id)": 24,
+    }.items():
+        assert sql(dataset.path, query)[1] == [(rows,)]
     with dataset.connect(origin=True, without=[broken]) as connection:
         assert connection.execute("SELECT count(*) FROM plans").fetchone() == (4,)
         assert connection.execute("SELECT count(*) FROM beside_labels").fetchone() == (12,)

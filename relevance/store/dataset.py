@@ -169,16 +169,21 @@ class Dataset(Files):
         origin: bool = False,
         without: Collection[Path] = (),
         memory: bool = False,
+        names: Collection[str] | None = None,
     ) -> duckdb.DuckDBPyConnection:
         """DuckDB with a view per table and all of `schemas/*.sql`; paths are absolute.
 
         A table without files is an empty view. `policy` chooses the labels; the dataset's own
         policy when None. With `origin` the table views also have `file` (within the dataset) and
         `row` (from 0); files in `without` are left out. With `memory` the tables are copied, for
-        many queries on a small dataset. Raises DatasetError for a file that cannot be read or has
-        other columns than its schema, and for a policy that the dataset does not have.
+        many queries on a small dataset. `names`: the tables and views that will be asked, which
+        alone are there and read; all when None. Raises DatasetError for a file of theirs that
+        cannot be read or has other columns than its schema, and for a policy that the dataset
+        does not have.
         """
-        return queries.connect(self, policy=policy, origin=origin, without=without, memory=memory)
+        return queries.connect(
+            self, policy=policy, origin=origin, without=without, memory=memory, names=names
+        )
 
     def content_hash(self, *, policy: str | None = None, split: str | None = None) -> str:
         """16 hex digits of what a model learns from: labels of one policy, images, of one split.

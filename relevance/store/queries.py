@@ -11,11 +11,11 @@ import duckdb
 
 from relevance.store import compacting, labellings
 from relevance.store.files import Files
+from relevance.store.needs import everything, needs, views
 from relevance.store.paths import DatasetError, filesystem, is_remote
 from relevance.store.scans import nothing, scans
-from relevance.store.tables import SCHEMAS, TABLES, one_line, table_schema
+from relevance.store.tables import TABLES, one_line, table_schema
 
-_VIEWS = ("views.sql", "changes.sql", "card.sql")
 _READING = ("SELECT", "MULTI")
 """Statements that read, in DuckDB's words: SELECT, FROM, WITH, SHOW, DESCRIBE, SUMMARIZE; PIVOT."""
 
@@ -27,10 +27,15 @@ def connect(
     origin: bool = False,
     without: Collection[Path] = (),
     memory: bool = False,
+    names: Collection[str] | None = None,
 ) -> duckdb.DuckDBPyConnection:
-    """See `Dataset.connect`."""
+    """See `Dataset.connect`; `names`: the tables and views that there will be, all when None."""
+    names = everything() if names is None else names
+    dataset.files_under("labels", policy)  # an unknown policy is an error whatever is asked
     bodies: dict[str, str] = {}
     for table in TABLES:
+        if not {table, f"beside_{table}"} & {*names}:
+            continue
         schema = table_schema(table)
         files = [file for file in dataset.files_under(table, policy) if file not in without]
         gathered = None
@@ -40,7 +45,7 @@ def connect(
         versions = {file: int(footer["version"]) for file, footer in made_by.items()}
         body = gathered or " UNION ALL ".join(scans(dataset, schema, versions, origin=origin))
         bodies[table] = body or nothing(schema, origin=origin)
-        if schema.beside:
+        if f"beside_{table}" in names:
             beside = dict(_beside(dataset, table, files, made_by, without))
             body = " UNION ALL ".join(scans(dataset, schema, beside, origin=origin))
             bodies[f"beside_{table}"] = body or nothing(schema, origin=origin)
@@ -50,8 +55,9 @@ def connect(
         connection.register_filesystem(filesystem(dataset.path))
     for name, body in bodies.items():
         connection.execute(f"CREATE {'TABLE' if memory else 'VIEW'} {name} AS {body}")
-    for file in _VIEWS:
-        connection.execute((SCHEMAS / file).read_text(encoding="utf-8"))
+    for name, statement in views().items():
+        if name in names:
+            connection.execute(statement)
     return connection
 
 
@@ -74,7 +80,7 @@ def sql(
         raise DatasetError(
             f"query: {found[0].type.name}: expected a statement that reads (SELECT, FROM, ...)"
         )
-    with connect(Files.open(path), policy=policy) as connection:
+    with connect(Files.open(path), policy=policy, names=needs(query)) as connection:
         try:
             result = connection.execute(found[0])
             names = [column[0] for column in result.description or ()]
