@@ -67,6 +67,9 @@ class PoseBound:
         self.problem = problem
         self._blockers: dict[str, dict[Grasp, frozenset[str]]] = {}
         self._more: dict[str, dict[Grasp, frozenset[str]]] = {}
+        self._close: dict[str, tuple[list[frozenset[str]], list[frozenset[str]]]] = {}
+        """For objects about whose pick less than CLOSE may decide: who is in the way of each grasp
+        with that much more room asked for, and less."""
         self._goal_poses: dict[tuple, Placement | None] = {}
         self._held: dict[tuple[tuple[Grasp, ...], float], tuple] = {}
         self._intervals: dict[float, tuple[float, float]] = {}
@@ -95,7 +98,12 @@ class PoseBound:
 
     def pickable(self, name: str, gone: frozenset[str]) -> bool:
         """Whether the object can be taken once the objects in `gone` have left."""
-        return bool(self._deep(name, gone) or self._others(name, gone))
+        found = bool(self._deep(name, gone) or self._others(name, gone))
+        if name in self._close and self.problem.above[name] <= gone:
+            self.more_blockers(name)
+            surely, perhaps = (any(who <= gone for who in sets) for sets in self._close[name])
+            self.problem.undecided |= surely != perhaps
+        return found
 
     def _deep(self, name: str, gone: frozenset[str]) -> tuple[Grasp, ...]:
         self.problem.counts.pose += 1
@@ -198,15 +206,26 @@ class PoseBound:
         if any(reached.values()):
             blocking = np.zeros((len(family.grasps), count), np.bool_)
             boxes = problem.obstacles[:count]
-            gaps = pick_blockers(i, family.axes, family.parts, boxes, blocking)
             names, seen = list(problem.boxes), {}
-            for g, grasp in enumerate(family.grasps):
-                if reached[grasp.above]:
-                    bits = blocking[g].tobytes()
-                    if bits not in seen:
-                        seen[bits] = frozenset(compress(names, blocking[g].tolist()))
-                    found[grasp] = seen[bits]
-                    problem.undecided |= grasp.price == 0.0 and bool(gaps[g] < CLOSE)
+
+            def blockers(room: float) -> tuple[list[frozenset[str]], float]:
+                close = pick_blockers(i, family.axes, family.parts, boxes, room, blocking)
+                sets = []
+                for g, grasp in enumerate(family.grasps):
+                    if reached[grasp.above]:
+                        bits = blocking[g].tobytes()
+                        if bits not in seen:
+                            seen[bits] = frozenset(compress(names, blocking[g].tolist()))
+                        sets.append(seen[bits])
+                return sets, close
+
+            sets, close = blockers(PICK_MARGIN)
+            found = dict(zip((g for g in family.grasps if reached[g.above]), sets, strict=True))
+            if close < CLOSE or name in self._close:
+                before = list(self._blockers.get(name, {}).values())
+                more, less = self._close.setdefault(name, (before, list(before)))
+                more += blockers(PICK_MARGIN + CLOSE)[0]
+                less += blockers(PICK_MARGIN - CLOSE)[0]
         problem.seconds.pose += time.process_time() - began
         return found
 
@@ -402,13 +421,13 @@ def _underside(rows: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def pick_blockers(i, axes, parts, obstacles, blocking):
+def pick_blockers(i, axes, parts, obstacles, room, blocking):
     """Fill blocking (G, N) bool: which boxes are in the way of taking box i with each grasp.
 
-    axes (G,), parts (G, 5, 5): of the grasps. obstacles (N, UPRIGHT): all the boxes. Returns how
-    close the closest decision of each grasp was, (G,), m.
+    axes (G,), parts (G, 5, 5): of the grasps. obstacles (N, UPRIGHT): all the boxes. room: asked
+    for around the hand, m. Returns how close the closest decision was, m.
     """
-    closest = np.ones(len(axes))
+    closest = 1.0
     o = obstacles[i]
     bottom, top = o[2] - o[6], o[2] + o[6]
     for k in range(len(obstacles)):
@@ -420,11 +439,12 @@ def pick_blockers(i, axes, parts, obstacles, blocking):
             if k == i or apart > HAND_REACH:
                 continue
             angle = o[3] + axes[g] * math.pi / 2
-            gap = clearance(o[0], o[1], angle, bottom, parts[g, 1:], other) - PICK_MARGIN
+            gap = clearance(o[0], o[1], angle, bottom, parts[g, 1:], other) - room
             if other[0, 2] - other[0, 6] >= top - 2e-3:  # what overhangs blocks the way up
-                gap = min(gap, clearance(o[0], o[1], angle, top, parts[g, :1], other))
+                over = clearance(o[0], o[1], angle, top, parts[g, :1], other)
+                gap = min(gap, over + PICK_MARGIN - room)
             blocking[g, k] = gap < 0
-            closest[g] = min(closest[g], abs(gap))
+            closest = min(closest, abs(gap))
     return closest
 
 
