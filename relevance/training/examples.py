@@ -33,7 +33,7 @@ class Goals:
     pairs: np.ndarray
     """(K, 2) int64: subject and reference, by place in the scene."""
     relevant: np.ndarray
-    """(K, N) bool."""
+    """(K, N) bool; float32 shares of the tied sets where labels are soft."""
     labelled: np.ndarray
     """(K, N) bool; False for padding and for objects without a label."""
     first: np.ndarray
@@ -116,19 +116,21 @@ def load_examples(
     predicates: Sequence[str] = (),
     cache_bytes: int = 1_500_000_000,
     folder: Path | None = None,
+    soft: bool = False,
 ) -> Examples:
     """Read the labels of a split and decode the scenes that they are about.
 
     Raises DatasetError for a broken file, labels that were not all made in one way, a label about
     a scene that is not there, or an image of another size than the camera's. Arrays over
     `cache_bytes` are mapped from a nameless file in `folder`. `predicates` are those whose
-    labels are read, all when empty.
+    labels are read, all when empty; `soft` reads them from `soft_labels`.
     """
     one_labelling(dataset, split, policy)
-    query = """
+    answer, of = ("target", "soft_labels") if soft else ("relevant", "labels")
+    query = f"""
         select scene_id, predicate, subject, reference, list(query order by query),
-            list(relevant order by query)
-        from labels where split = ? and policy = ? and (? or not ambiguous)
+            list({answer} order by query)
+        from {of} where split = ? and policy = ? and (? or not ambiguous)
             and (? or predicate in (select unnest(?::varchar[])))
         group by all order by all
     """
@@ -168,7 +170,8 @@ def load_examples(
         present[done, :count] = True
         place = {name: i for i, name in enumerate(sample.scene.names)}
         for _, predicate, subject, reference, queries, answers in asked:
-            relevant, labelled = np.zeros(objects, bool), np.zeros(objects, bool)
+            relevant = np.zeros(objects, np.float32 if soft else bool)
+            labelled = np.zeros(objects, bool)
             index = [place[query] for query in queries]
             relevant[index], labelled[index] = answers, True
             pair = [place[subject], place[reference]]
