@@ -15,7 +15,7 @@ from relevance.store.paths import DatasetError, filesystem, is_remote
 from relevance.store.scans import nothing, scans
 from relevance.store.tables import SCHEMAS, TABLES, one_line, table_schema
 
-_VIEWS = ("views.sql", "changes.sql", "card.sql", "learning.sql")
+_VIEWS = ("views.sql", "changes.sql", "card.sql", "judged.sql")
 _READING = ("SELECT", "MULTI")
 """Statements that read, in DuckDB's words: SELECT, FROM, WITH, SHOW, DESCRIBE, SUMMARIZE; PIVOT."""
 

@@ -24,6 +24,7 @@ from relevance.models import GEOMETRY, PATCH, STRIDE, mirrored, true_geometry
 from relevance.scene import PREDICATES, Camera, Predicate
 from relevance.store import Dataset, DatasetError, Files
 from relevance.training.settings import TrainConfig
+from relevance.training.soft import target, tied_sets
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -123,14 +124,13 @@ def load_examples(
     Raises DatasetError for a broken file, labels that were not all made in one way, a label about
     a scene that is not there, or an image of another size than the camera's. Arrays over
     `cache_bytes` are mapped from a nameless file in `folder`. `predicates` are those whose
-    labels are read, all when empty; `soft` reads them from `soft_labels`.
+    labels are read, all when empty; `soft` gives the shares of the sets that tie.
     """
     one_labelling(dataset, split, policy)
-    answer, of = ("target", "soft_labels") if soft else ("relevant", "labels")
-    query = f"""
+    query = """
         select scene_id, predicate, subject, reference, list(query order by query),
-            list({answer} order by query)
-        from {of} where split = ? and policy = ? and (? or not ambiguous)
+            list(relevant order by query), plan_id
+        from labels where split = ? and policy = ? and (? or not ambiguous)
             and (? or predicate in (select unnest(?::varchar[])))
         group by all order by all
     """
@@ -138,6 +138,7 @@ def load_examples(
         rows = connection.execute(
             query, [split, policy, ambiguous, not predicates, list(predicates)]
         ).fetchall()
+    sets = tied_sets(dataset.read_rows("plans", split=split)) if soft else {}
     labels: dict[str, list[tuple[Any, ...]]] = {
         key: list(group) for key, group in groupby(rows, key=lambda row: row[0])
     }
@@ -169,11 +170,14 @@ def load_examples(
         geometry[done, :count] = true_geometry(sample.scene)
         present[done, :count] = True
         place = {name: i for i, name in enumerate(sample.scene.names)}
-        for _, predicate, subject, reference, queries, answers in asked:
+        for _, predicate, subject, reference, queries, answers, plan_id in asked:
             relevant = np.zeros(objects, np.float32 if soft else bool)
             labelled = np.zeros(objects, bool)
             index = [place[query] for query in queries]
-            relevant[index], labelled[index] = answers, True
+            tied = sets.get(plan_id, ())
+            pairs = zip(queries, answers, strict=True)
+            relevant[index] = [target(query, answer, tied) for query, answer in pairs]
+            labelled[index] = True
             pair = [place[subject], place[reference]]
             found.setdefault(PREDICATES[predicate], []).append((done, pair, relevant, labelled))
         names.append(sample.scene.id)

@@ -1,25 +1,4 @@
--- Views about what networks learn and how right they are. Plain DuckDB SQL; shares are 0..1.
-
--- The labels as `--soft-labels` learns them: `target` is the share of the sets that tie (all that
--- a plan of the least length moves) in which the object is; 0 or 1 where one set is alone, and
--- where the plan is of a time that did not keep the others.
-CREATE OR REPLACE VIEW soft_labels AS
-WITH sets AS (
-    SELECT
-        plan_id,
-        list_distinct(list_transform(alternatives, lambda names: list_sort(names))) AS sets
-    FROM plans
-    WHERE ambiguous
-)
-SELECT
-    l.*,
-    CASE
-        WHEN len(s.sets) > 1
-            THEN len(list_filter(s.sets, lambda names: list_contains(names, l.query)))
-                / len(s.sets)
-        ELSE l.relevant::INTEGER::DOUBLE
-    END AS target
-FROM labels AS l LEFT JOIN sets AS s USING (plan_id);
+-- Views about how right networks are. Plain DuckDB SQL; shares are 0..1.
 
 -- One row an object and what carries it, over others too: a box on a box on `base` stands on it.
 CREATE OR REPLACE VIEW carried AS
