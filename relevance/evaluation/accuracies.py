@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -50,8 +51,11 @@ class Predictions:
 
     def of(self, group: str) -> Predictions:
         """Rows of one predicate or of a family of scenes, see `in_group`."""
-        pairs = zip(self.predicate, self.family, strict=True)
-        return self.where(np.array([in_group(name, group, family) for name, family in pairs], bool))
+        mask = np.zeros(len(self), bool)
+        for predicate, family in product(np.unique(self.predicate), np.unique(self.family)):
+            if in_group(predicate, group, family):
+                mask |= (self.predicate == predicate) & (self.family == family)
+        return self.where(mask)
 
     def queries(self) -> Predictions:
         """Rows other than those of subject and reference."""
@@ -117,31 +121,21 @@ class Breakdown:
     title: str
     of: Callable[[Predictions], np.ndarray]
     """The part that a row belongs to; parts are shown in their order."""
-    name: Callable[[Any], str] = str
-    """How a part is called."""
 
 
-def _quarter(number: int) -> str:
-    return f"{25 * number} to {25 * number + 25}%"
-
+_QUARTERS = np.array(["0 to 25%", "25 to 50%", "50 to 75%", "75 to 100%"])
 
 BREAKDOWNS = {
-    "predicate": Breakdown(
-        title="By predicate",
-        of=lambda p: np.array([list(PREDICATES).index(name) for name in p.predicate], int),
-        name=lambda number: list(PREDICATES)[number],
-    ),
+    "predicate": Breakdown(title="By predicate", of=lambda p: p.predicate),
     "stands": Breakdown(title="By where the query stands", of=lambda p: p.stands),
     "n_objects": Breakdown(title="By number of objects", of=lambda p: p.n_objects),
     "visible": Breakdown(
         title="By how much of the query shows",
-        of=lambda p: np.clip(4 * p.visible_fraction, 0, 3).astype(int),
-        name=_quarter,
+        of=lambda p: _QUARTERS[np.clip(4 * p.visible_fraction, 0, 3).astype(int)],
     ),
     "ambiguous": Breakdown(
         title="By whether another answer would do",
-        of=lambda p: p.ambiguous,
-        name=lambda yes: "ambiguous" if yes else "one answer",
+        of=lambda p: np.where(p.ambiguous, "ambiguous", "one answer"),
     ),
 }
 """What a network's accuracy is broken down by, besides the family of scenes."""
@@ -165,14 +159,14 @@ def breakdown_table(
 
     (What `always irrelevant` scores in total is the base rate.)
     """
-    breakdown, table = BREAKDOWNS[by], []
+    table = []
     for family, part in _families(predictions):
-        parts = breakdown.of(part)
+        parts = BREAKDOWNS[by].of(part)
         for value in np.unique(parts):
             rows = part.where(parts == value)
             rule = Accuracy.of(JUDGES[RULE](rows), rows.relevant).total
             figures = _figures(rows, rows.score, beta)
-            table.append({"family": family, by: breakdown.name(value), **figures, "rule": rule})
+            table.append({"family": family, by: value.item(), **figures, "rule": rule})
     return table
 
 
