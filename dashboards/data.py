@@ -80,9 +80,9 @@ def _ask(
 
 @st.cache_data(show_spinner=False, max_entries=8)
 def predictions(choice: Choice) -> tuple[Predictions, list[str]]:
-    """The checkpoint's predictions on the queries of the split, and what to know of them."""
+    """The checkpoint's predictions on the split, and what to know of them."""
     dataset, name = Dataset.open(choice.path), choice.checkpoint or ""
-    found = read_predictions(dataset, name, split=choice.split).queries()
+    found = read_predictions(dataset, name, split=choice.split)
     return found, unjudged(dataset, name, split=choice.split)
 
 

@@ -1,4 +1,4 @@
-"""Figures about scores and samples, each defined once: accuracy, intervals, bootstrap.
+"""Figures about scores and samples, each defined once: accuracy, calibration, intervals.
 
 An object is kept iff its score > -beta (CONTRIBUTING, The words), everywhere.
 """
@@ -22,7 +22,7 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accuracy:
-    """Shares of objects judged rightly at one beta, in 0..1; nan where there are none."""
+    """How objects are judged at one beta, shares in 0..1; nan where there is nothing to judge."""
 
     n_rows: int
     share_relevant: float
@@ -31,12 +31,17 @@ class Accuracy:
     true_irrelevant: float
     """Of the irrelevant objects, the share left out."""
     total: float
+    """Of all objects, the share judged rightly."""
     base_rate: float
     """What `always irrelevant` scores in total."""
     n_tasks: int
-    """Tasks that the objects belong to; 0 when they were not told."""
+    """Tasks (goals) that the objects belong to; 0 when they were not told."""
+    set_recall: float
+    """Share of a task's relevant objects that were kept, averaged over tasks that have any."""
     tasks_whole: float
     """Share of tasks in which every relevant object was kept, so that `prune` can succeed."""
+    tasks_right: float
+    """Share of tasks in which every object was judged rightly."""
 
     @property
     def balanced(self) -> float:
@@ -54,10 +59,14 @@ class Accuracy:
     ) -> Accuracy:
         """Of scores, labels and, if known, task numbers of objects, (R,) each."""
         kept = score > -beta
-        tasks, numbers = np.unique([] if task is None else task, return_inverse=True)
-        lost = np.zeros(len(tasks), dtype=bool)
-        if task is not None:
-            np.logical_or.at(lost, numbers, relevant & ~kept)
+        tasks, number = np.unique([] if task is None else task, return_inverse=True)
+
+        def count(rows: np.ndarray) -> np.ndarray:
+            """How many such rows each task has."""
+            return np.bincount(number, rows if task is not None else [], minlength=len(tasks))
+
+        wanted, found = count(relevant), count(relevant & kept)
+        asked = wanted > 0
         return cls(
             n_rows=len(score),
             share_relevant=mean(relevant),
@@ -66,28 +75,63 @@ class Accuracy:
             total=mean(kept == relevant),
             base_rate=mean(~relevant),
             n_tasks=len(tasks),
-            tasks_whole=mean(~lost),
+            set_recall=mean(found[asked] / wanted[asked]),
+            tasks_whole=mean(found == wanted),
+            tasks_right=mean(count(kept != relevant) == 0),
         )
 
 
-def accuracy(score: np.ndarray, relevant: np.ndarray) -> dict[str, float | int | None]:
-    """What a checkpoint keeps of its own accuracy at beta = 0, as JSON; None for nan.
+def accuracy(
+    score: np.ndarray, relevant: np.ndarray, *, task: np.ndarray | None = None
+) -> dict[str, Any]:
+    """What a checkpoint keeps of its own accuracy, as JSON; None for nan.
 
-    The shares are those of `Accuracy`, beside them `auc` and `best_beta`; eta makes beta = 0
-    lean towards keeping.
+    The shares are those of `Accuracy` at beta = 0 and, under `tuned`, at `best_beta`; the other
+    figures are of the scores alone.
     """
-    found = Accuracy.of(score, relevant)
-    shares = {
-        name: getattr(found, name)
-        for name in ("true_relevant", "true_irrelevant", "total", "base_rate", "balanced")
-    }
+    beta = best_beta(score, relevant)
     return {
         "relevant": int(relevant.sum()),
         "irrelevant": int((~relevant).sum()),
-        **{name: None if np.isnan(share) else share for name, share in shares.items()},
+        **_shares(Accuracy.of(score, relevant, task=task)),
+        "average_precision": _known(average_precision(score, relevant)),
         "auc": auc(score, relevant),
-        "best_beta": best_beta(score, relevant),
+        "best_beta": beta,
+        "tuned": _shares(Accuracy.of(score, relevant, beta=beta or 0.0, task=task)),
     }
+
+
+def _shares(found: Accuracy) -> dict[str, float | None]:
+    names = ("true_relevant", "true_irrelevant", "total", "base_rate", "balanced")
+    names += ("set_recall", "tasks_whole", "tasks_right")
+    return {name: _known(getattr(found, name)) for name in names}
+
+
+def _known(value: float) -> float | None:
+    return None if np.isnan(value) else value
+
+
+def average_precision(score: np.ndarray, relevant: np.ndarray) -> float:
+    """Mean over the relevant objects of the share that is relevant among those that score as high.
+
+    nan without a relevant object; a constant score reaches the share of relevant objects.
+    """
+    order = np.argsort(-score, kind="stable")
+    ranked, hits = score[order], np.cumsum(relevant[order])
+    if not len(hits) or not hits[-1]:
+        return float("nan")
+    last = np.flatnonzero(np.r_[ranked[1:] < ranked[:-1], True])  # equal scores come together
+    return float(np.diff(hits[last], prepend=0) @ (hits[last] / (last + 1)) / hits[-1])
+
+
+def calibration_error(score: np.ndarray, relevant: np.ndarray) -> float:
+    """How far the probability is from the share that is relevant, in tenths of the probability,
+    each weighing as many objects as it has; nan without any.
+    """
+    probability = 1 / (1 + np.exp(-np.clip(score, -700, 700)))
+    tenth = np.minimum((10 * probability).astype(int), 9)
+    gaps = np.bincount(tenth, probability - relevant)
+    return float(np.abs(gaps).sum() / len(score)) if len(score) else float("nan")
 
 
 def auc(score: np.ndarray, relevant: np.ndarray) -> float | None:
@@ -101,19 +145,26 @@ def auc(score: np.ndarray, relevant: np.ndarray) -> float | None:
 
 
 def best_beta(score: np.ndarray, relevant: np.ndarray) -> float | None:
-    """The beta half-way between the scores where most objects are judged rightly."""
+    """The beta half-way between the scores where most objects are judged rightly.
+
+    Of several that judge as many rightly it is the one nearest to 0; None without objects.
+    """
     if not len(score):
         return None
     order = np.argsort(-score, kind="stable")
     ranked = np.r_[np.inf, score[order], -np.inf]
     gained = np.r_[0, np.cumsum(np.where(relevant[order], 1, -1))]
-    # Objects of equal score are kept together.
-    splits = ranked[:-1] > ranked[1:]
-    best = int(np.argmax(np.where(splits, gained, -len(score))))
-    above, below = ranked[best], ranked[best + 1]
-    if np.isinf(above) or np.isinf(below):
-        return float(-below - 1.0) if np.isinf(above) else float(-above + 1.0)
-    return float(-(above + below) / 2)
+    above, below = ranked[:-1], ranked[1:]
+    apart = above > below  # objects of equal score are kept together
+    best = apart & (gained == gained[apart].max())
+    above, below = above[best], below[best]
+    # Beyond the highest and the lowest score: by one.
+    above, below = (
+        np.where(np.isinf(above), below + 2, above),
+        np.where(np.isinf(below), above - 2, below),
+    )
+    betas = -(above + below) / 2
+    return float(betas[np.argmin(np.abs(betas))])
 
 
 def mean(values: Any) -> float:

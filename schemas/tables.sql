@@ -15,7 +15,8 @@ CREATE OR REPLACE VIEW checkpoints AS
 FROM read_parquet(
     getvariable('dataset') || '/checkpoints/*.parquet',
     hive_partitioning = false, union_by_name = true
-);
+)
+UNION ALL BY NAME SELECT NULL::VARCHAR AS "offsets" WHERE false;
 
 CREATE OR REPLACE VIEW durations AS
 FROM read_parquet(
@@ -61,7 +62,8 @@ CREATE OR REPLACE VIEW predictions AS
 FROM read_parquet(
     getvariable('dataset') || '/predictions/checkpoint_id=*/split=*/*.parquet',
     hive_partitioning = false, union_by_name = true
-);
+)
+UNION ALL BY NAME SELECT NULL::DOUBLE AS "offset" WHERE false;
 
 CREATE OR REPLACE VIEW scenes AS
 FROM read_parquet(

@@ -1,78 +1,20 @@
-"""Accuracies, intervals and speed-ups against figures by hand."""
+"""Intervals and speed-ups against figures by hand."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from evaluated import evaluated
-from hypothesis import given
-from hypothesis import strategies as st
 
 from relevance.evaluation import (
-    Predictions,
     guided_cost,
     read_evaluations,
-    read_predictions,
     settings,
     speed_table,
     summarise,
 )
-from relevance.metrics import Accuracy, accuracy, mean_interval, ratio_interval
+from relevance.metrics import mean_interval, ratio_interval
 from relevance.store import Dataset
-
-BY_HAND = Predictions(
-    predicate=np.array(["on", "on", "on", "behind", "behind", "behind"]),
-    task=np.array([1, 1, 1, 2, 2, 2]),
-    relevant=np.array([True, False, True, False, True, False]),
-    score=np.array([2.0, -1.0, -3.0, 0.0, 1.0, 4.0]),
-    is_goal_object=np.array([False, False, False, False, True, False]),
-)
-
-
-def test_accuracy_by_hand() -> None:
-    found = BY_HAND.accuracy()
-    assert (found.n_tasks, found.n_rows) == (2, 6)
-    assert found.true_relevant == pytest.approx(2 / 3)
-    assert found.true_irrelevant == pytest.approx(2 / 3)  # a score of 0 is left out at beta 0
-    assert found.total == pytest.approx(4 / 6)
-    assert found.base_rate == pytest.approx(3 / 6)
-    assert found.tasks_whole == pytest.approx(1 / 2)
-    looser = BY_HAND.accuracy(beta=3.5)
-    assert looser.true_relevant == 1.0
-    assert looser.true_irrelevant == 0.0
-    assert BY_HAND.of("on").accuracy().total == pytest.approx(2 / 3)
-    assert BY_HAND.of("same-plane").queries().accuracy().n_rows == 2
-    assert np.isnan(BY_HAND.of("same-plane").queries().accuracy().true_relevant)
-
-
-def test_a_checkpoint_keeps_the_same_shares_that_a_report_shows() -> None:
-    found, kept = BY_HAND.accuracy(), accuracy(BY_HAND.score, BY_HAND.relevant)
-    for name in ("true_relevant", "true_irrelevant", "total", "base_rate", "balanced"):
-        assert kept[name] == getattr(found, name)
-    assert Accuracy.of(BY_HAND.score, BY_HAND.relevant).n_tasks == 0
-
-
-@given(
-    st.lists(st.tuples(st.booleans(), st.floats(-9, 9)), min_size=1, max_size=30),
-    st.floats(-9, 9),
-    st.floats(0, 9),
-)
-def test_a_larger_beta_keeps_more(rows, beta, more) -> None:
-    relevant, score = (np.array(column) for column in zip(*rows, strict=True))
-    n = len(rows)
-    predictions = Predictions(
-        predicate=np.full(n, "on"),
-        task=np.arange(n) // 3,
-        relevant=relevant,
-        score=score,
-        is_goal_object=np.zeros(n, bool),
-    )
-    tight, loose = predictions.accuracy(beta), predictions.accuracy(beta + more)
-    if relevant.any():
-        assert loose.true_relevant >= tight.true_relevant
-    if not relevant.all():
-        assert loose.true_irrelevant <= tight.true_irrelevant
-    assert loose.tasks_whole >= tight.tasks_whole
 
 
 def row(unguided: float, guided: float, solved: tuple[bool, bool], predicate: str = "on") -> dict:
@@ -145,16 +87,6 @@ def test_a_ratio_is_of_sums_and_paired() -> None:
     found = ratio_interval(slow, slow / 2)
     assert (found.low, found.value, found.high) == pytest.approx((2.0, 2.0, 2.0))
     assert ratio_interval([1.0, 9.0], [1.0, 1.0]).value == pytest.approx(5.0)
-
-
-def test_predictions_are_read_with_their_tasks() -> None:
-    root, checkpoint = evaluated()
-    dataset = Dataset.open(root)
-    found = read_predictions(dataset, checkpoint.stem)
-    plans = {r["plan_id"] for r in dataset.read_rows("labels", split="test")}
-    assert len(np.unique(found.task)) == len(plans)
-    assert len(found.queries()) == len(found) - 2 * len(plans)
-    assert len(read_predictions(dataset, "none")) == 0
 
 
 def test_the_table_of_speed_ups_counts_misses() -> None:

@@ -10,7 +10,13 @@ import pytest
 from evaluated import DATA, evaluated, labelled
 from streamlit.testing.v1 import AppTest
 
-from relevance.evaluation import read_evaluations, read_predictions, settings, summarise
+from relevance.evaluation import (
+    BREAKDOWNS,
+    read_evaluations,
+    read_predictions,
+    settings,
+    summarise,
+)
 from relevance.pipeline import describe
 from relevance.report.style import TIMES
 from relevance.store import Dataset
@@ -46,6 +52,11 @@ def test_figures_are_those_of_the_rows(page) -> None:
     for group in ("same-plane", "on"):
         accuracy = found.of(group).accuracy()
         assert shown[f"Total, {group}"] == f"{100 * accuracy.total:.1f}%"
+    frames = [frame.value for frame in page(root, "accuracy").dataframe]
+    assert len(frames) == 2 + len(BREAKDOWNS)
+    for frame, by in zip(frames[1:-1], BREAKDOWNS, strict=True):
+        assert frame["objects"].sum() == len(found)
+        assert frame[by].is_unique or by != "predicate"
     rows = settings(read_evaluations(dataset, checkpoint.stem))["tree", "prune-then-full", 0.0]
     expected = summarise(rows).speedup.value
     shown = values(page(root, "speed"))

@@ -20,7 +20,7 @@ from relevance.report import gallery
 from relevance.report.gallery import outlined
 from relevance.report.page import build
 from relevance.report.paper import paper
-from relevance.report.style import KEPT, LOST, RELEVANT, TIMES, guide_style, seconds
+from relevance.report.style import KEPT, LOST, RELEVANT, TIMES, guide_style, percent, seconds
 from relevance.store import Dataset, DatasetError
 from relevance.training import load_checkpoint
 
@@ -112,15 +112,22 @@ def test_the_whole_page_says_what_the_rows_say() -> None:
     root, checkpoint = evaluated()
     page = whole(page_of_everything())
     dataset = Dataset.open(root)
-    predictions = figures.read_predictions(dataset, checkpoint.stem).queries()
-    metrics = load_checkpoint(checkpoint)[1]["metrics"]
-    for group, theirs in (("same-plane", "94%"), ("on", "87%")):
-        plain = predictions.of(group).accuracy()
-        beta = metrics[group]["queries"]["best_beta"]
-        found = predictions.of(group).accuracy(beta)
-        card = f"{100 * found.total:.1f}% accuracy, {group} base rate {100 * found.base_rate:.1f}%"
-        tuned = f"beta {beta:.1f} from validation, {100 * plain.total:.1f}% at beta 0"
-        assert f"{card}; {found.n_tasks} tasks; {tuned}; paper: {theirs}" in page.text
+    everything = figures.read_predictions(dataset, checkpoint.stem)
+    table = figures.accuracy_table(everything.queries())
+    found = {(row["family"], row["judge"]): row for row in table}
+    for family, theirs in (("same-plane", "94%"), ("on", "87%")):
+        row, rule = found[family, figures.NETWORK], found[family, figures.RULE]
+        card = f"{100 * row['total']:.1f}% accuracy, {family}"
+        rules = (
+            f"always irrelevant: {100 * row['base_rate']:.1f}%; rule: {100 * rule['total']:.1f}%"
+        )
+        assert f"{card} {rules}; {row['tasks']} tasks; paper: {theirs}" in page.text
+    for title in (question.title for question in figures.BREAKDOWNS.values()):
+        assert title in page.text
+    for shown in (*table, *figures.accuracy_table(everything)):
+        assert f"{shown['judge']} {percent(shown['true_relevant'])}" in page.text
+    for name, offset in load_checkpoint(checkpoint)[1]["offsets"].items():
+        assert f"{offset:+.2f} ({name})" in page.text
     rows = figures.settings(figures.read_evaluations(dataset, checkpoint.stem))
     whole_guide = figures.summarise(rows["tree", "prune-then-full", 0.0])
     assert f"{whole_guide.speedup.value:.2f}{TIMES} speed-up by prune-then-full" in page.text

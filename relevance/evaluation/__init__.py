@@ -1,8 +1,20 @@
 """What a checkpoint is worth: its accuracy, and the planner rerun with and without it.
 
 beta (CONTRIBUTING, The words): an object is kept iff score > -beta; goal objects are always kept.
+A checkpoint's offset is part of every score here, so that beta = 0 is what validation chose.
 """
 
+from relevance.evaluation.accuracies import (
+    BREAKDOWNS,
+    JUDGES,
+    NETWORK,
+    RULE,
+    Predictions,
+    accuracy_table,
+    breakdown_table,
+    in_group,
+    read_predictions,
+)
 from relevance.evaluation.comparisons import (
     Comparison,
     guided_cost,
@@ -13,14 +25,7 @@ from relevance.evaluation.comparisons import (
     speed_table,
     summarise,
 )
-from relevance.evaluation.predictions import (
-    Predictions,
-    in_group,
-    policy_of_checkpoint,
-    predict,
-    read_predictions,
-    unjudged,
-)
+from relevance.evaluation.predictions import policy_of_checkpoint, predict, unjudged
 from relevance.evaluation.reruns import (
     EvaluationConfig,
     Task,
@@ -37,12 +42,18 @@ from relevance.evaluation.scorer import (
 )
 
 __all__ = [
+    "BREAKDOWNS",
+    "JUDGES",
+    "NETWORK",
+    "RULE",
     "Comparison",
     "EvaluationConfig",
     "EvaluationError",
     "NetworkScorer",
     "Predictions",
     "Task",
+    "accuracy_table",
+    "breakdown_table",
     "checkpoint_id",
     "choose_tasks",
     "compare",

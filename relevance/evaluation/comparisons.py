@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from relevance.evaluation.predictions import in_group
+from relevance.evaluation.accuracies import in_group
 from relevance.metrics import Interval, mean, mean_interval, ratio_interval
 from relevance.planner import PLANNER_VERSION
 from relevance.scene import FAMILIES, group_of

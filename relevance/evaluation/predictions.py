@@ -1,24 +1,16 @@
-"""What a checkpoint says of every labelled object: scored into rows, and read back as columns.
-
-Judged by the labels of the policy that the checkpoint learned, as they are when they are read.
-
-Shape suffixes: R rows of predictions.
-"""
+"""What a checkpoint says of every labelled object, as rows, and whether they are up to date."""
 
 from __future__ import annotations
 
 import json
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from relevance.evaluation.scorer import EvaluationError, enter, open_checkpoint, policy_of
-from relevance.metrics import Accuracy
-from relevance.scene import PREDICATES, Goal, group_of
+from relevance.scene import PREDICATES, Goal
 from relevance.store import Dataset, Labelling
 
 Progress = Callable[[int, int], None]
@@ -73,7 +65,11 @@ def predict(
                 scored = dict(zip(sample.scene.names, values, strict=True))
                 rows += [
                     {name: label[name] for name in _PREDICTED}
-                    | {"checkpoint_id": scorer.checkpoint_id, "score": scored[query]}
+                    | {
+                        "checkpoint_id": scorer.checkpoint_id,
+                        "score": scored[query],
+                        "offset": scorer.offset(label["predicate"]),
+                    }
                     for query, label in queries.items()
                 ]
         dataset.write_rows("predictions", rows, name=scorer.checkpoint_id, split=split, shard=shard)
@@ -101,86 +97,6 @@ def policy_of_checkpoint(dataset: Dataset, checkpoint_id: str) -> str:
 def _goal(row: dict[str, Any]) -> Goal:
     return Goal(
         predicate=PREDICATES[row["predicate"]], subject=row["subject"], reference=row["reference"]
-    )
-
-
-# --- reading ------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Predictions:
-    """Predictions of one checkpoint as columns, (R,) each."""
-
-    predicate: np.ndarray
-    """As figures name it: the family where that is not the predicate's own (`group_of`)."""
-    task: np.ndarray
-    """Number of the task that the row belongs to."""
-    relevant: np.ndarray
-    score: np.ndarray
-    is_goal_object: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.score)
-
-    def where(self, mask: np.ndarray) -> Predictions:
-        """The rows that a boolean mask (R,) selects."""
-        return Predictions(
-            predicate=self.predicate[mask],
-            task=self.task[mask],
-            relevant=self.relevant[mask],
-            score=self.score[mask],
-            is_goal_object=self.is_goal_object[mask],
-        )
-
-    def of(self, group: str) -> Predictions:
-        """Rows of one predicate, or of the family `same-plane`; `all` gives everything."""
-        if group == "all":
-            return self
-        return self.where(np.array([in_group(name, group) for name in self.predicate], bool))
-
-    def queries(self) -> Predictions:
-        """Rows other than those of subject and reference."""
-        return self.where(~self.is_goal_object)
-
-    def accuracy(self, beta: float = 0.0) -> Accuracy:
-        """Shares judged rightly when an object is kept iff score > -beta."""
-        return Accuracy.of(self.score, self.relevant, beta=beta, task=self.task)
-
-
-def in_group(predicate: str, group: str) -> bool:
-    """Whether a predicate, as figures name it, is in `all`, in a family or the group itself."""
-    if group in ("all", predicate):
-        return True
-    return predicate in PREDICATES and PREDICATES[predicate].family == group
-
-
-def read_predictions(dataset: Dataset, checkpoint_id: str, *, split: str = "test") -> Predictions:
-    """Predictions of a checkpoint on a split, in a fixed order.
-
-    Each is judged by the present label of the checkpoint's policy; a score without such a label
-    is left out, see `unjudged`.
-    """
-    policy = policy_of_checkpoint(dataset, checkpoint_id)
-    with dataset.connect(policy=policy) as connection:
-        columns = connection.execute(
-            """
-            select predicate, family, l.relevant, score, l.is_goal_object,
-                dense_rank() over (order by scene_id, predicate, subject, reference) as task
-            from predictions
-            join labels l using (split, scene_id, predicate, subject, reference, query)
-            left join shard_families using (split, shard)
-            where checkpoint_id = ? and split = ? and l.policy = ?
-            order by task, query
-            """,
-            [checkpoint_id, split, policy],
-        ).fetchnumpy()
-    pairs = zip(columns["predicate"], columns["family"], strict=True)
-    return Predictions(
-        predicate=np.array([group_of(predicate, family) for predicate, family in pairs], str),
-        task=np.asarray(columns["task"], dtype=int),
-        relevant=np.asarray(columns["relevant"], dtype=bool),
-        score=np.asarray(columns["score"], dtype=float),
-        is_goal_object=np.asarray(columns["is_goal_object"], dtype=bool),
     )
 
 

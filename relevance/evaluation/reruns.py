@@ -40,7 +40,7 @@ from relevance.planner import (
 from relevance.scene import PREDICATES, Goal, Scene
 from relevance.store import Dataset
 
-EVALUATION_VERSION = "1"
+EVALUATION_VERSION = "2"
 """Raised when rows of equal settings would come out otherwise."""
 
 

@@ -36,6 +36,10 @@ from relevance.store import Dataset
 PAGE = "README.md"
 MADE_WITH = ("relevance", "numpy", "pybullet", "casadi", "numba", "pyarrow", "duckdb")
 """Packages whose versions the card states."""
+ACCURACY = (
+    "How right networks are on it: `relevance report` and `relevance dashboard` under Accuracy; "
+    "in SQL the view `judged`."
+)
 _WIDTH, _DPI = 7.2, 110
 
 
@@ -73,7 +77,7 @@ def write_card(root: str | Path, out: str | Path) -> Path:
 
 def card(found: Statistics, dataset: Dataset, pictures: Mapping[str, str] = {}) -> str:
     """The page: what there is, pictures (file stem -> title), tables, and what made it."""
-    lines = [f"# Dataset {Path(found.path).resolve().name}", "", _summary(found), ""]
+    lines = [f"# Dataset {Path(found.path).resolve().name}", "", _summary(found), "", ACCURACY, ""]
     for name, title in pictures.items():
         lines += [f"![{title}]({name}.png)", "", f"*{title}.*", ""]
     for table in found.tables:

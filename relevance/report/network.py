@@ -8,10 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from relevance.evaluation import Predictions, read_predictions, unjudged
-from relevance.metrics import Accuracy
+from relevance.evaluation import (
+    BREAKDOWNS,
+    accuracy_table,
+    breakdown_table,
+    read_predictions,
+    unjudged,
+)
 from relevance.report import plots
-from relevance.report.style import groups as shown_groups
 from relevance.store import Dataset
 
 
@@ -19,13 +23,13 @@ def network_section(
     dataset: Dataset, checkpoints: Sequence[dict[str, Any]], chosen: str | None
 ) -> dict[str, Any]:
     """Checkpoints, and the accuracies of the chosen one by the labels of its policy."""
-    predictions = read_predictions(dataset, chosen).queries() if chosen else None
     model: dict[str, Any] = {
         "checkpoints": [row | {"metrics": json.loads(row["metrics"])} for row in checkpoints],
         "chosen": next((row for row in checkpoints if row["checkpoint_id"] == chosen), None),
         "accuracies": [],
+        "breakdowns": [],
         "with_goal_objects": [],
-        "tuned": {},
+        "offsets": {},
         "n_tasks": 0,
         "plots": {},
         "notes": unjudged(dataset, chosen) if chosen else [],
@@ -33,13 +37,17 @@ def network_section(
     history = _history(dataset, model["chosen"])
     if history:
         model["plots"]["training"] = plots.svg("training", plots.training_curve, history=history)
-    if predictions is None or not len(predictions):
+    everything = read_predictions(dataset, chosen or "")
+    if not len(everything):
         return model
-    everything = read_predictions(dataset, str(chosen))
-    groups = [g for g in shown_groups() if len(predictions.of(g))]
-    model["accuracies"] = [(group, predictions.of(group).accuracy()) for group in groups]
-    model["with_goal_objects"] = [(group, everything.of(group).accuracy()) for group in groups]
-    model["tuned"] = _tuned(predictions, groups, model["chosen"])
+    predictions = everything.queries()
+    model["accuracies"] = accuracy_table(predictions)
+    model["with_goal_objects"] = accuracy_table(everything)
+    model["breakdowns"] = [
+        (by, question.title, breakdown_table(predictions, by))
+        for by, question in BREAKDOWNS.items()
+    ]
+    model["offsets"] = json.loads(model["chosen"]["offsets"] or "{}")
     model["n_tasks"] = len(np.unique(predictions.task))
     panels = len(plots.families_in(predictions))
     model["plots"] |= {
@@ -56,19 +64,6 @@ def network_section(
         ),
     }
     return model
-
-
-def _tuned(
-    predictions: Predictions, groups: Sequence[str], chosen: Mapping[str, Any] | None
-) -> dict[str, tuple[float, Accuracy]]:
-    """By group: the beta with the highest total on validation, and what it gives on test."""
-    metrics = json.loads(chosen["metrics"]) if chosen else {}
-    found = {}
-    for group in groups:
-        beta = metrics.get(group, {}).get("queries", {}).get("best_beta")
-        if beta is not None:
-            found[group] = (beta, predictions.of(group).accuracy(beta))
-    return found
 
 
 def _history(dataset: Dataset, chosen: Mapping[str, Any] | None) -> list[dict[str, float]]:

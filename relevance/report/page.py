@@ -16,7 +16,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from relevance.evaluation import policy_of_checkpoint
+from relevance.evaluation import NETWORK, RULE, policy_of_checkpoint
 from relevance.metrics import Interval
 from relevance.report import style
 from relevance.report.data import data_section, planner_section
@@ -182,20 +182,22 @@ def _headlines(
                 "link": "#planner",
             }
         )
-    for group, plain in model["accuracies"]:
-        if group in GROUPS:
-            theirs = paper().accuracy.get(group)
-            beta, accuracy = model["tuned"].get(group, (0.0, plain))
-            cards.append(
-                {
-                    "value": percent(accuracy.total),
-                    "label": f"accuracy, {group}",
-                    "note": f"base rate {percent(accuracy.base_rate)}; {accuracy.n_tasks} tasks; "
-                    f"beta {beta:.1f} from validation, {percent(plain.total)} at beta 0; "
-                    f"paper: {percent(theirs.total, 0) if theirs else DASH}",
-                    "link": "#model",
-                }
-            )
+    by_judge = {(row["family"], row["judge"]): row for row in model["accuracies"]}
+    for group in GROUPS:
+        network = by_judge.get((group, NETWORK))
+        if network is None:
+            continue
+        rule, theirs = by_judge[group, RULE], paper().accuracy.get(group)
+        cards.append(
+            {
+                "value": percent(network["total"]),
+                "label": f"accuracy, {group}",
+                "note": f"always irrelevant: {percent(network['base_rate'])}; "
+                f"rule: {percent(rule['total'])}; {network['tasks']} tasks; "
+                f"paper: {percent(theirs.total, 0) if theirs else DASH}",
+                "link": "#model",
+            }
+        )
     for search in guided["searches"][:1]:
         for comparison in search["comparisons"][-1][1]:
             if not comparison.n_solvable:

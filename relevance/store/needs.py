@@ -15,7 +15,7 @@ import duckdb
 
 from relevance.store.tables import SCHEMAS, TABLES, table_schema
 
-_FILES = ("views.sql", "changes.sql", "card.sql")
+_FILES = ("views.sql", "changes.sql", "card.sql", "judged.sql")
 _HEAD = re.compile(r"CREATE OR REPLACE VIEW (\w+) AS\s")
 
 

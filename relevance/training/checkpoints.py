@@ -159,6 +159,7 @@ def write_row(dataset: Dataset, path: Path, meta: Mapping[str, Any]) -> None:
         "metrics": json.dumps(meta["metrics"], sort_keys=True),
         "config": json.dumps(meta["config"], sort_keys=True),
         "config_hash": meta["config_hash"],
+        "offsets": json.dumps(meta.get("offsets", {}), sort_keys=True),
     }
     dataset.write_rows("checkpoints", [row], name=meta["checkpoint_id"])
 

@@ -24,6 +24,7 @@ from relevance.models import GEOMETRY, PATCH, STRIDE, mirrored, true_geometry
 from relevance.scene import PREDICATES, Camera, Predicate
 from relevance.store import Dataset, DatasetError, Files
 from relevance.training.settings import TrainConfig
+from relevance.training.soft import target, tied_sets
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -33,7 +34,7 @@ class Goals:
     pairs: np.ndarray
     """(K, 2) int64: subject and reference, by place in the scene."""
     relevant: np.ndarray
-    """(K, N) bool."""
+    """(K, N) bool; float32 shares of the tied sets where labels are soft."""
     labelled: np.ndarray
     """(K, N) bool; False for padding and for objects without a label."""
     first: np.ndarray
@@ -120,18 +121,19 @@ def load_examples(
     families: Sequence[str] = (),
     cache_bytes: int = 1_500_000_000,
     folder: Path | None = None,
+    soft: bool = False,
 ) -> Examples:
     """Read the labels of a split and decode the scenes that they are about.
 
     Raises DatasetError for a broken file, labels that were not all made in one way, a label about
     a scene that is not there, or an image of another size than the camera's. Arrays over
-    `cache_bytes` are mapped from a nameless file in `folder`. `predicates` and
-    `families` are those whose labels are read, all when empty.
+    `cache_bytes` are mapped from a nameless file in `folder`. `predicates` and `families` are
+    those whose labels are read, all when empty; `soft` gives the shares of the sets that tie.
     """
     one_labelling(dataset, split, policy)
     query = """
         select scene_id, predicate, subject, reference, list(query order by query),
-            list(relevant order by query), family
+            list(relevant order by query), plan_id, family
         from labels left join shard_families using (split, shard)
         where split = ? and policy = ? and (? or not ambiguous)
             and (? or predicate in (select unnest(?::varchar[])))
@@ -141,6 +143,7 @@ def load_examples(
     with dataset.connect(policy=policy) as connection:
         asked_for = [not predicates, list(predicates), not families, list(families)]
         rows = connection.execute(query, [split, policy, ambiguous, *asked_for]).fetchall()
+    sets = tied_sets(dataset.read_rows("plans", split=split)) if soft else {}
     labels: dict[str, list[tuple[Any, ...]]] = {
         key: list(group) for key, group in groupby(rows, key=lambda row: row[0])
     }
@@ -173,10 +176,14 @@ def load_examples(
         geometry[done, :count] = true_geometry(sample.scene)
         present[done, :count] = True
         place = {name: i for i, name in enumerate(sample.scene.names)}
-        for _, predicate, subject, reference, queries, answers, _ in asked:
-            relevant, labelled = np.zeros(objects, bool), np.zeros(objects, bool)
+        for _, predicate, subject, reference, queries, answers, plan_id, _ in asked:
+            relevant = np.zeros(objects, np.float32 if soft else bool)
+            labelled = np.zeros(objects, bool)
             index = [place[query] for query in queries]
-            relevant[index], labelled[index] = answers, True
+            tied = sets.get(plan_id, ())
+            pairs = zip(queries, answers, strict=True)
+            relevant[index] = [target(query, answer, tied) for query, answer in pairs]
+            labelled[index] = True
             pair = [place[subject], place[reference]]
             found.setdefault(PREDICATES[predicate], []).append((done, pair, relevant, labelled))
         names.append(sample.scene.id)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, field, replace
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from relevance.configs import config, execution, identity_hash
 from relevance.models import BODIES, ModelConfig, model_config
@@ -83,6 +83,9 @@ class TrainConfig:
     """The label policy to learn."""
     ambiguous: bool = True
     """Whether goals with a second moved set of the same length are learned from."""
+    soft_labels: bool = False
+    """Where several sets tie, learn of each object the share of them that it is in, instead of
+    the one that was found (policy `found`)."""
     bfloat16: Literal["auto", "on", "off"] = "auto"
     """Autocast; auto: only on processors that multiply bfloat16 (others emulate it slowly)."""
     device: str = execution("auto")
@@ -93,6 +96,12 @@ class TrainConfig:
     """Steps between saved states."""
     cache_bytes: Annotated[int, Field(ge=0)] = execution(1_500_000_000)
     """Decoded images up to this size stay in memory."""
+
+    @model_validator(mode="after")
+    def _tied(self) -> Self:
+        if self.soft_labels and self.policy != "found":
+            raise ValueError(f"soft_labels are of policy found, expected it, got {self.policy}")
+        return self
 
     @classmethod
     def smoke(cls) -> Self:

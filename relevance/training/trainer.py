@@ -37,6 +37,7 @@ from relevance.training.checkpoints import (
     write_file,
     write_row,
 )
+from relevance.training.decision import offsets, yaws
 from relevance.training.examples import Examples, draw_batches, gather, load_examples
 from relevance.training.losses import batch_loss
 from relevance.training.settings import TrainConfig
@@ -204,7 +205,7 @@ def train(
             f"{dataset.path}: no labels of {min(lacking)} with split train and policy "
             f"{config.policy}, which the settings ask for"
         )
-    start = _start(dataset, config, examples)
+    start, before = _start(dataset, config, examples)
     with _threads(config.threads):
         trainer = Trainer(replace(config, model=start.config) if start else config, examples, start)
         if unfinished.exists():
@@ -232,6 +233,8 @@ def train(
         "bfloat16": trainer.bfloat16,
         "parameters": sum(p.numel() for p in trainer.model.parameters()),
         "metrics": metrics,
+        "offsets": offsets(metrics, before),
+        "yaws": yaws(dataset),
         "history": trainer.history,
     }
     save_checkpoint(path, trainer.model, meta)
@@ -240,10 +243,15 @@ def train(
     return path
 
 
-def _start(dataset: Dataset, config: TrainConfig, examples: Examples) -> RelevanceModel | None:
-    """The model whose weights stay; raises CheckpointError where nothing new would be learned."""
+def _start(
+    dataset: Dataset, config: TrainConfig, examples: Examples
+) -> tuple[RelevanceModel | None, dict[str, float]]:
+    """The model whose weights stay, and its offsets, which stay too.
+
+    Raises CheckpointError where nothing new would be learned.
+    """
     if not config.start:
-        return None
+        return None, {}
     model, meta = load_checkpoint(find_checkpoint(dataset.path, config.start))
     if meta["checkpoint_id"] != config.start:
         raise CheckpointError(f"start: {config.start} is no id, it holds {meta['checkpoint_id']}")
@@ -252,7 +260,7 @@ def _start(dataset: Dataset, config: TrainConfig, examples: Examples) -> Relevan
         raise CheckpointError(
             f"start: {config.start} has a head for {min(there)}, expected new --predicates"
         )
-    return model
+    return model, meta.get("offsets", {})
 
 
 def _load(dataset: Dataset, split: str, config: TrainConfig, folder: Path) -> Examples:
@@ -266,6 +274,7 @@ def _load(dataset: Dataset, split: str, config: TrainConfig, folder: Path) -> Ex
         families=config.families,
         cache_bytes=config.cache_bytes,
         folder=folder,
+        soft=config.soft_labels and split == "train",
     )
 
 
@@ -283,11 +292,12 @@ def _threads(count: int) -> Iterator[None]:
 
 
 def measure(model: RelevanceModel, examples: Examples, batch: int = 16) -> dict[str, Any]:
-    """Metrics per predicate on all goals of the examples, at beta = 0; see `accuracy`.
+    """Metrics per predicate on all goals of the examples, of the network's own scores (no offset
+    added); see `accuracy`.
 
-    `queries` leaves subject and reference out, `with_goal_objects` has them; `whole_goals` is
-    the share of goals with every query right. `same-plane` pools its four predicates; what a
-    predicate is asked in another family than its own stands under that family.
+    `queries` leaves subject and reference out, `with_goal_objects` has them. `same-plane` pools
+    its four predicates; what a predicate is asked in another family than its own stands under
+    that family.
     """
     model.eval()
     pooled: dict[str, list[tuple[np.ndarray, ...]]] = {}
@@ -313,16 +323,12 @@ def measure(model: RelevanceModel, examples: Examples, batch: int = 16) -> dict[
 
 def _metrics(parts: list[tuple[np.ndarray, ...]]) -> dict[str, Any]:
     goals = [goal for part in parts for goal in zip(*part, strict=True) if goal[2].any()]
-    right = [
-        bool((((score > 0) == relevant) | ~(labelled & query)).all())
-        for score, relevant, labelled, query in goals
-    ]
     score, relevant, query = (
         np.concatenate([goal[i][goal[2]] for goal in goals]) for i in (0, 1, 3)
     )
+    task = np.repeat(np.arange(len(goals)), [goal[2].sum() for goal in goals])
     return {
         "goals": len(goals),
-        "whole_goals": float(np.mean(right)),
-        "queries": accuracy(score[query], relevant[query]),
-        "with_goal_objects": accuracy(score, relevant),
+        "queries": accuracy(score[query], relevant[query], task=task[query]),
+        "with_goal_objects": accuracy(score, relevant, task=task),
     }
