@@ -258,10 +258,10 @@ def _attempt(
             left = (end - spent.seconds.total) / (len(problems) - number)
             if left <= 0 or ended[number][0] == NO_SEQUENCE:
                 continue
-            found, *why = _run(problem, seed, left, spent)
+            found, reason, exhausted = _run(problem, seed, left, spent)
             if found is not None:
                 return _solved(scene, goal, problem, found, spent)
-            ended[number] = why[0], why[1]
+            ended[number] = reason, exhausted
     reason = next((why for why, _ in ended.values() if why), "")
     if reason == NO_SEQUENCE:
         reason = "the rules allow rai no action sequence"
