@@ -258,14 +258,15 @@ def _attempt(
             left = (end - spent.seconds.total) / (len(problems) - number)
             if left <= 0 or ended[number][0] == NO_SEQUENCE:
                 continue
-            found, why, exhausted = _run(problem, seed, left, spent)
+            found, reason, exhausted = _run(problem, seed, left, spent)
             if found is not None:
                 return _solved(scene, goal, problem, found, spent)
-            ended[number] = why, exhausted
+            ended[number] = reason, exhausted
     reason = next((why for why, _ in ended.values() if why), "")
     if reason == NO_SEQUENCE:
         reason = "the rules allow rai no action sequence"
-    status = "infeasible" if all(tried for _, tried in ended.values()) else "limit"
+    exhausted = all(exhausted for _, exhausted in ended.values())
+    status = "infeasible" if exhausted else "limit"
     reason = reason or f"rai found no plan in {config.seconds:g} s"
     return PlanResult(
         goal=goal, status=status, reason=reason, final={}, counts=spent.counts,
