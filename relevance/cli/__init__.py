@@ -18,11 +18,10 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr, suppress
-from typing import get_args
 
 import tyro
 
-from relevance.cli.arguments import Command, Preset
+from relevance.cli.arguments import Command, one_of
 from relevance.cli.commands import COMMANDS
 from relevance.cli.terminal import UsageError, say
 from relevance.errors import RelevanceWarning
@@ -84,7 +83,7 @@ def _run(name: str, rest: list[str]) -> int:
         raise UsageError(f"unknown command {name!r}, expected one of {known}")
     command = COMMANDS[name]
     decided = (_value(rest, flag) for flag in command.decides)
-    run = command.make(_preset(rest, command.preset), *decided)
+    run = command.make(_preset(rest, command), *decided)
     about = "\n".join([(run.__doc__ or "").partition("Args:")[0].strip(), "", "examples:"])
     about += "".join(f"\n  {example}" for example in command.examples)
     return _parse(name, run, f"{about}\n\n{CODES}", rest)()
@@ -115,15 +114,11 @@ def _first(page: str) -> str:
     return " ".join(" ".join(said).split())
 
 
-def _preset(arguments: Sequence[str], default: Preset) -> Preset:
+def _preset(arguments: Sequence[str], command: Command) -> str:
     """The preset on the command line, read first since the other defaults depend on it."""
-    known: dict[str, Preset] = {name: name for name in get_args(Preset)}
     value = _value(arguments, "--preset")
-    if value is None:
-        return default
-    if value not in known:
-        raise UsageError(f"--preset {value}: expected one of {', '.join(known)}")
-    return known[value]
+    one_of("--preset", value, command.presets)
+    return command.preset if value is None else value
 
 
 def _value(arguments: Sequence[str], flag: str) -> str | None:

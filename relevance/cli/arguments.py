@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import tyro
 
@@ -30,6 +30,7 @@ class Command:
     about: str
     examples: tuple[str, ...]
     preset: Preset = "demo"
+    presets: tuple[str, ...] = get_args(Preset)
     decides: tuple[str, ...] = ()
     """Flags whose values `make` takes after the preset: other flags depend on them."""
 

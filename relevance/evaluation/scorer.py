@@ -10,7 +10,7 @@ import math
 import time
 import warnings
 from collections import OrderedDict
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,11 +19,14 @@ import numpy as np
 from relevance.errors import RelevanceError, RelevanceWarning
 from relevance.planner import Guide
 from relevance.sampling import Randomisation
-from relevance.scene import Camera, Goal, Scene, lookalikes
+from relevance.scene import Camera, Goal, Predicate, Scene, lookalikes
 from relevance.store import Dataset
 
 if TYPE_CHECKING:  # models imports torch, which the planner and the report do without
     from relevance.models import RelevanceModel
+
+
+_SAME_YAW = math.radians(1)
 
 
 class EvaluationError(RelevanceError):
@@ -34,8 +37,9 @@ class NetworkScorer:
     """Scores from a checkpoint; encodes a scene once and answers all its goals from that.
 
     Scenes that were not shown to `observe` are rendered. Keeps the last `capacity` scenes. A
-    scene whose picture would have another size than the model takes is refused; one whose
-    camera stands elsewhere, or whose boxes look the same, gives a RelevanceWarning.
+    scene whose picture would have another size than the model takes is refused, and one whose
+    robot is turned as none was that it learned from; one whose camera stands elsewhere, or whose
+    boxes look the same, gives a RelevanceWarning.
     """
 
     def __init__(
@@ -44,12 +48,19 @@ class NetworkScorer:
         *,
         checkpoint_id: str = "",
         policy: str = "found",
+        offsets: Mapping[str, float] = {},
+        yaws: Sequence[float] = (0.0,),
         capacity: int = 64,
     ) -> None:
         self.model = model
         self.checkpoint_id = checkpoint_id
         self.policy = policy
         """The label policy that it learned."""
+        self.offsets = dict(offsets)
+        """By predicate, what is added to the network's logit (0 for others), so that beta = 0
+        decides as validation chose."""
+        self.yaws = tuple(yaws)
+        """How the robots that it learned from were turned, rad."""
         self.capacity = capacity
         self.seconds = 0.0
         """CPU seconds of the last `scores`, a needed encoding included, rendering left out."""
@@ -79,12 +90,19 @@ class NetworkScorer:
         """Drop every encoding, so that the next call of `scores` pays for its own."""
         self._encodings.clear()
 
+    def offset(self, predicate: Predicate | str) -> float:
+        """What a score has beyond the network's own logit."""
+        return self.offsets.get(str(predicate), 0.0)
+
     def scores(self, scene: Scene, goal: Goal) -> dict[str, float]:
-        """Logit of every object of the scene."""
+        """Score of every object of the scene."""
         return dict(zip(scene.names, self.score_goals(scene, [goal])[0].tolist(), strict=True))
 
     def score_goals(self, scene: Scene, goals: Sequence[Goal]) -> np.ndarray:
-        """Logits of every object for several goals, (G, N); EvaluationError for nan."""
+        """Scores of every object for several goals, (G, N): the network's logits and the offsets.
+
+        Raises EvaluationError where they are no numbers.
+        """
         key = shown(scene)
         if key not in self._seen:
             from relevance.simulation import Renderer  # pybullet: only when there is no picture
@@ -118,7 +136,8 @@ class NetworkScorer:
                     for n in which
                 ]
                 asked = torch.tensor([pairs], device=device)
-                scores[which] = self.model.decode(encoding, predicate, asked)[0].cpu()
+                logits = self.model.decode(encoding, predicate, asked)[0].cpu()
+                scores[which] = logits.double() + self.offset(predicate)
         self.seconds = time.process_time() - start
         if not np.isfinite(scores).all():
             raise EvaluationError(
@@ -128,8 +147,16 @@ class NetworkScorer:
         return scores
 
     def _check(self, scene: Scene) -> None:
-        """Refuse a picture of another size; warn of another camera and of lookalikes."""
+        """Refuse a robot turned otherwise and a picture of another size; warn of another camera
+        and of lookalikes."""
         mine, its = self.model.config.camera, scene.camera
+        turns = (math.remainder(scene.robot.yaw - yaw, math.tau) for yaw in self.yaws)
+        if not any(abs(turn) < _SAME_YAW for turn in turns):
+            learned = ", ".join(f"{yaw:g}" for yaw in self.yaws)
+            raise EvaluationError(
+                f"scene {scene.id}: its robot is turned by {scene.robot.yaw:g} rad, the model was "
+                f"trained with robots turned by {learned}: left and right would mean other sides"
+            )
         if (its.width, its.height) != (mine.width, mine.height):
             raise EvaluationError(
                 f"scene {scene.id}: its camera takes {its.width}x{its.height} pixels, "
@@ -188,8 +215,14 @@ def open_checkpoint(checkpoint: str | Path) -> tuple[NetworkScorer, dict[str, An
     from relevance.training import load_checkpoint
 
     model, meta = load_checkpoint(checkpoint)
-    policy = policy_of(meta["config"])
-    return NetworkScorer(model, checkpoint_id=meta["checkpoint_id"], policy=policy), meta
+    scorer = NetworkScorer(
+        model,
+        checkpoint_id=meta["checkpoint_id"],
+        policy=policy_of(meta["config"]),
+        offsets=meta.get("offsets", {}),
+        yaws=meta.get("yaws", (0.0,)),
+    )
+    return scorer, meta
 
 
 def load_scorer(checkpoint: str | Path, *, into: Dataset | None = None) -> NetworkScorer:
