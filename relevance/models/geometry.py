@@ -84,6 +84,6 @@ BODIES.register(
         config=GeometryConfig,
         make=GeometryBody,
         version="1",
-        advantage="sees no picture: it is told the true poses of all objects",
+        advantage="is told the true poses of all objects and sees no picture",
     ),
 )

@@ -49,7 +49,7 @@ def _card(name: str, root: Path, config: TrainConfig, path: Path, meta: Mapping[
         f"| {group} | {found['goals']:,} | {q['relevant'] + q['irrelevant']:,} | "
         + " | ".join(_percent(q[key]) for key in ("true_relevant", "true_irrelevant", "total"))
         + f" | {_percent(q['base_rate'])} | {_number(q['auc'])} | "
-        f"{_number(offsets.get(group))} |"
+        f"{_number(offsets.get(group))} | {_percent(q.get('tuned', {}).get('total'))} |"
         for group, found in meta["metrics"].items()
         for q in [found["queries"]]
     ]
@@ -68,8 +68,8 @@ Queries of the validation split (subject and reference left out), the network's 
 beta = 0; the offset is what is added to them, so that beta = 0 is the decision that validation
 chose.
 
-| | goals | queries | true relevant | true irrelevant | total | base rate | AUC | offset |
-|---|---|---|---|---|---|---|---|---|
+| | goals | queries | true relevant | true irrelevant | total | base rate | AUC | offset | total so |
+|---|---|---|---|---|---|---|---|---|---|
 {chr(10).join(rows)}
 """
 
