@@ -35,7 +35,8 @@ def _predict(_: Preset) -> Callable[..., int]:
             image: The picture; PNG, WebP or JPEG.
             goal: What is wanted, e.g. 'on-the-left(red, blue)'; may be given several times.
             checkpoint: A file, or the name of a model that comes with this package.
-            views: Folder with a picture NAME.png of 32x32 pixels for each object.
+            views: Folder with a picture NAME.png of 32x32 pixels for each object, alone on grey as
+                in a dataset's views.
             crop: Cuts the view of an object from the picture instead: left, top, width and height
                 in pixels; may be given several times.
             beta: An object is relevant when its score exceeds -beta.

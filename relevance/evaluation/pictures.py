@@ -232,7 +232,7 @@ def _panel(seen: Seen, where: Mapping[str, Crop], judged: Sequence[Judged]) -> n
         color = _RELEVANT if one.relevant else _IRRELEVANT
         cv2.rectangle(picture, (x, y), (x + w, y + h), (255, 255, 255), 5)
         cv2.rectangle(picture, (x, y), (x + w, y + h), color, 2)
-        _write(picture, one.name, (x, max(y - 6, 12)), color, halo=True)
+        _write(picture, one.name, (x, max(y - 6, 12)), _INK, halo=True)
     cell, row = 190, 2 * VIEW_SIZE + 16
     columns = max(1, picture.shape[1] // cell)
     strip = np.full((34 + row * -(-len(judged) // columns), picture.shape[1], 3), 255, np.uint8)

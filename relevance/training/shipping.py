@@ -68,7 +68,7 @@ Queries of the validation split (subject and reference left out), the network's 
 beta = 0; the offset is what is added to them, so that beta = 0 is the decision that validation
 chose.
 
-| | goals | queries | true relevant | true irrelevant | total | base rate | AUC | offset | total so |
+| | goals | queries | true relevant | true irrelevant | total | base rate | AUC | offset | tuned |
 |---|---|---|---|---|---|---|---|---|---|
 {chr(10).join(rows)}
 """
