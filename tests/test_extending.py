@@ -23,7 +23,7 @@ from relevance.cli import main
 from relevance.configs import config
 from relevance.evaluation import read_predictions, speed_table
 from relevance.labels import POLICIES, Verdict
-from relevance.models import BODIES, Body, BodyKind, Encoding, ModelConfig
+from relevance.models import BODIES, Answer, Body, BodyKind, Encoding, ModelConfig
 from relevance.pipeline import Counts, DatasetConfig, labels_work, scenes_work
 from relevance.pipeline.checking import check
 from relevance.planner import GUIDES, PLANNERS, PlannerConfig
@@ -79,7 +79,7 @@ class MeanBody(Body):
 
     def decode(self, encoding, predicate, goals, asked):
         scores = self.heads[predicate.name](encoding.tokens)[..., 0]
-        return scores[:, None].expand(-1, goals.shape[1], -1)
+        return Answer(scores=scores[:, None].expand(-1, goals.shape[1], -1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

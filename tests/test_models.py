@@ -21,6 +21,7 @@ from relevance.models import (
     DECIMETRE,
     GEOMETRY,
     STRIDE,
+    Answer,
     Body,
     BodyKind,
     Encoding,
@@ -129,7 +130,7 @@ def test_attention_of_the_vit() -> None:
         assert isinstance(body, ViTBody)
         patches = body.embed(image.float() / 255).flatten(2).transpose(1, 2)
         pair = [body.embed(v[0, :3].float() / 255).flatten(1)[None] for v in (views, other)]
-        before, after = (body._transform(patches, three)[0, 2] for three in pair)
+        before, after = (body._transform(patches, three)[0][0, 2] for three in pair)
         assert ((before - after).abs().max() > 1e-4) == (name != "vit")
 
 
@@ -419,9 +420,9 @@ def test_a_body_is_registered_from_outside() -> None:
             predicate: Predicate,
             goals: torch.Tensor,
             asked: torch.Tensor,
-        ) -> torch.Tensor:
+        ) -> Answer:
             score = self.heads[predicate.name](encoding.tokens)[..., 0]
-            return score[:, None].expand(-1, goals.shape[1], -1)
+            return Answer(scores=score[:, None].expand(-1, goals.shape[1], -1))
 
     BODIES.register("mean", BodyKind(config=MeanConfig, make=MeanBody, version="1"))
     try:

@@ -21,7 +21,7 @@ from contextlib import redirect_stderr, suppress
 
 import tyro
 
-from relevance.cli.arguments import Command
+from relevance.cli.arguments import Command, one_of
 from relevance.cli.commands import COMMANDS
 from relevance.cli.terminal import UsageError, say
 from relevance.errors import RelevanceError, RelevanceWarning
@@ -115,8 +115,7 @@ def _first(page: str) -> str:
 def _preset(arguments: Sequence[str], command: Command) -> str:
     """The preset on the command line, read first since the other defaults depend on it."""
     value = _value(arguments, "--preset")
-    if value is not None and value not in command.presets:
-        raise UsageError(f"--preset {value}: expected one of {', '.join(command.presets)}")
+    one_of("--preset", value, command.presets)
     return command.preset if value is None else value
 
 

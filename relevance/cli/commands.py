@@ -5,11 +5,20 @@ from which tyro derives the flags; it imports only what its own flags need, and 
 imports the rest when it runs.
 """
 
-from relevance.cli import asking, benchmarks, learning, making, planning, running, sharing
+from relevance.cli import (
+    asking,
+    benchmarks,
+    learning,
+    making,
+    planning,
+    predicting,
+    running,
+    sharing,
+)
 from relevance.cli.arguments import Command
 
 COMMANDS: dict[str, Command] = {
     name: command
-    for group in (making, learning, planning, asking, sharing, running, benchmarks)
+    for group in (making, learning, planning, predicting, asking, sharing, running, benchmarks)
     for name, command in group.COMMANDS.items()
 }

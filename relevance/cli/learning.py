@@ -1,16 +1,17 @@
-"""Subcommands about models: train, evaluate."""
+"""Subcommands about models: train, ship, evaluate."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 from collections.abc import Callable
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, get_args
 
 import tyro
 
-from relevance.cli.arguments import Command, DatasetArg, OptionalPath, Preset
+from relevance.cli.arguments import Command, DatasetArg, OptionalName, OptionalPath, Preset
 from relevance.cli.terminal import bar, say
 
 
-def _train(preset: Preset, body: str | None = None) -> Callable[..., int]:
+def _train(preset: str, body: str | None = None) -> Callable[..., int]:
     from relevance.training import TrainConfig
 
     start: TrainConfig = getattr(TrainConfig, preset)()
@@ -37,6 +38,38 @@ def _train(preset: Preset, body: str | None = None) -> Callable[..., int]:
         return 0
 
     return train
+
+
+def _ship(preset: str, body: str | None = None) -> Callable[..., int]:
+    from relevance.training import TrainConfig
+
+    start: TrainConfig = getattr(TrainConfig, preset)()
+    if body is not None:
+        start = start.with_body(body)
+
+    def ship(
+        dataset: DatasetArg,
+        out: Path = Path("data/models"),
+        name: OptionalName = None,
+        config: Annotated[TrainConfig, tyro.conf.arg(name="")] = start,
+    ) -> int:
+        """Make a model that comes with the package: train it, halve it, write a page about it.
+
+        What was trained with these settings on this dataset is taken. Prints the path.
+
+        Args:
+            dataset: Folder of a labelled dataset.
+            out: Folder of the models; those of a checkout are in data/models.
+            name: What it is called; the body when not given.
+        """
+        from relevance.training import ship
+
+        with bar("steps") as progress:
+            path = ship(dataset, config, out, name=name or "", progress=progress)
+        print(path)
+        return 0
+
+    return ship
 
 
 def _evaluate(preset: Preset) -> Callable[..., int]:
@@ -79,7 +112,16 @@ COMMANDS = {
         examples=(
             "relevance train data/tables --preset laptop",
             "relevance train data/tables --steps 3000 --model.body vit --model.width 64",
+            "relevance train data/tables --preset fair --model.body resnet",
         ),
+        presets=(*get_args(Preset), "fair"),
+        decides=("--model.body",),
+    ),
+    "ship": Command(
+        make=_ship,
+        about="make a model that comes with the package",
+        examples=("relevance ship data/tables --preset laptop --model.body geometry",),
+        presets=(*get_args(Preset), "fair"),
         decides=("--model.body",),
     ),
     "evaluate": Command(

@@ -49,7 +49,8 @@ def _plan(_: Preset) -> Callable[..., int]:
             search: The paper's breadth-first tree, or our informed search.
             guide: How the scores of the checkpoint enter the search: none, prune,
                 prune-then-full, expand or order.
-            checkpoint: The model that scores the objects; a guide needs one.
+            checkpoint: The model that scores the objects, which a guide needs: a file, or the name
+                of one that comes with the package (glimpse, geometry).
             beta: An object is kept when its score exceeds -beta.
             limit: Most nodes that the search may open for a goal.
             max_actions: Most picks and places in a plan.

@@ -20,7 +20,7 @@ a picture of a scene whose robot is turned shows nothing that a model was traine
 from importlib import import_module
 from pkgutil import iter_modules
 
-from relevance.models.config import PATCH, STRIDE, Encoding, ModelConfig, ModelError
+from relevance.models.config import PATCH, STRIDE, Answer, Encoding, ModelConfig, ModelError, Sight
 from relevance.models.layers import Attention, Extractor
 from relevance.models.poses import (
     ANGLES,
@@ -49,6 +49,7 @@ __all__ = [
     "GEOMETRY",
     "PATCH",
     "STRIDE",
+    "Answer",
     "Attention",
     "Body",
     "BodyKind",
@@ -57,6 +58,7 @@ __all__ = [
     "ModelConfig",
     "ModelError",
     "RelevanceModel",
+    "Sight",
     "half_extents",
     "mirrored",
     "model_config",

@@ -1,7 +1,6 @@
 """What every body has in common: settings, the size of pictures, and what seeing a scene gives.
 
-Shape suffixes: B scenes, N objects (padded), D width, h and w height and width of the stride-4
-feature map.
+Shape suffixes: B scenes, N objects (padded), G goals, T queries, K looks, D width.
 """
 
 from __future__ import annotations
@@ -54,6 +53,11 @@ class ModelConfig:
         return cls()
 
     @classmethod
+    def fair(cls) -> Self:
+        """Sizes that a CPU can train, with all the help that the fair recipe gives a body."""
+        return cls()
+
+    @classmethod
     def paper(cls) -> Self:
         """The paper's sizes; the defaults for a body that the paper does not have."""
         return cls()
@@ -63,6 +67,27 @@ def divides(width: int, heads: int) -> None:
     """Raise ValueError unless the attention heads share the width evenly."""
     if width % heads:
         raise ValueError(f"width is {width}, expected a multiple of heads {heads}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sight:
+    """Where objects were seen: what the auxiliary losses hold against masks and poses.
+
+    K looks at an object, of the whole batch; an object may be looked at more than once.
+    """
+
+    scene: Tensor
+    """(K,) the scene's place in the batch."""
+    place: Tensor
+    """(K,) the object's place in the scene."""
+    geometry: Tensor
+    """(K, GEOMETRY) estimated, decimetres."""
+    match: Tensor
+    """(K, P) logits of which cell of an even grid over the image shows it."""
+    grid: tuple[int, int]
+    """Rows and columns of the grid, P cells in all."""
+    attention: Tensor | None = None
+    """(K, P) the same as said by a layer's attention, for bodies with attention over the image."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,5 +103,15 @@ class Encoding:
     scene: Tensor | None = None
     """(B, ...) what was seen of the scene apart from its objects, for bodies that look at a
     subject, a reference and a query together."""
-    match: Tensor | None = None
-    """(B, N, h*w) logits of where the object is in the feature map (glimpse)."""
+    sight: Sight | None = None
+    """Where each object that is there was seen, in training."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Answer:
+    """Scores, and what was seen on the way to them by a body that looks anew for each query."""
+
+    scores: Tensor
+    """(B, G, N) logits, or (T,) of T queries."""
+    sight: Sight | None = None
+    """Where subjects, references and queries were seen, in training."""

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from relevance.configs import config
-from relevance.models.config import Encoding, ModelConfig, divides
+from relevance.models.config import Answer, Encoding, ModelConfig, divides
 from relevance.models.layers import Attention, columns
 from relevance.models.poses import GEOMETRY
 from relevance.models.reasoning import Reasoning, object_heads
@@ -71,11 +71,11 @@ class GeometryBody(Body):
 
     def decode(
         self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
-    ) -> Tensor:
-        """As `RelevanceModel.decode`."""
+    ) -> Answer:
+        """As `RelevanceModel.answer`."""
         assert encoding.geometry is not None
         x = self.reason(encoding.tokens, encoding.present, encoding.geometry, predicate, goals)
-        return self.heads[predicate.name](x).squeeze(-1)
+        return Answer(scores=self.heads[predicate.name](x).squeeze(-1))
 
 
 BODIES.register(
@@ -84,6 +84,6 @@ BODIES.register(
         config=GeometryConfig,
         make=GeometryBody,
         version="1",
-        advantage="sees no picture: it is told the true poses of all objects",
+        advantage="is told the true poses of all objects and sees no picture",
     ),
 )

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from relevance.configs import config
-from relevance.models.config import PATCH, STRIDE, Encoding, ModelConfig, divides
+from relevance.models.config import PATCH, STRIDE, Answer, Encoding, ModelConfig, Sight, divides
 from relevance.models.layers import Attention, columns, small_cnn
 from relevance.models.poses import DECIMETRE, GEOMETRY
 from relevance.models.reasoning import Reasoning, object_heads
@@ -118,7 +118,14 @@ class GlimpseBody(Body):
         geometry = torch.cat([geometry[..., :2] + ground_BN2, geometry[..., 2:]], dim=-1)
         tokens = self.token(torch.cat([seen, geometry], dim=-1))
         tokens = self.among(tokens, columns(present))
-        return Encoding(tokens=tokens, present=present, geometry=geometry, match=match_BNP)
+        sight = None
+        if self.training:
+            at = scene_K, place_K = present.nonzero(as_tuple=True)
+            grid = image.shape[-2] // STRIDE, image.shape[-1] // STRIDE
+            sight = Sight(
+                scene=scene_K, place=place_K, geometry=geometry[at], match=match_BNP[at], grid=grid
+            )
+        return Encoding(tokens=tokens, present=present, geometry=geometry, sight=sight)
 
     def _window(self, image: Tensor, where_BNP: Tensor, centre_BN2: Tensor) -> Tensor:
         """Windows around the centres, (B*N, 4, 32, 32): colours and match map."""
@@ -139,11 +146,11 @@ class GlimpseBody(Body):
 
     def decode(
         self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
-    ) -> Tensor:
-        """As `RelevanceModel.decode`."""
+    ) -> Answer:
+        """As `RelevanceModel.answer`."""
         assert encoding.geometry is not None
         x = self.reason(encoding.tokens, encoding.present, encoding.geometry, predicate, goals)
-        return self.heads[predicate.name](x).squeeze(-1)
+        return Answer(scores=self.heads[predicate.name](x).squeeze(-1))
 
 
 def _cell_centres(camera: Camera) -> Tensor:

@@ -6,13 +6,16 @@ C channels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from relevance.models.config import PATCH
+from relevance.models.config import PATCH, Answer, Sight
+from relevance.models.poses import GEOMETRY
+from relevance.scene import Camera
 
 
 class Attention(nn.Module):
@@ -36,6 +39,17 @@ class Attention(nn.Module):
         seen = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
         x = x + self.out(seen.transpose(1, 2).reshape(batch, length, width))
         return x + self.mlp(self.norm_mid(x))
+
+    def looks(self, x: Tensor, rows: slice, columns: slice) -> Tensor:
+        """Log of the share (B, R, C) of these rows' attention that goes to each of the columns.
+
+        The mean over the heads, so that not all need to look there; columns among themselves.
+        """
+        batch, length, width = x.shape
+        qkv = self.qkv(self.norm_in(x)).view(batch, length, 3, self.heads, width // self.heads)
+        q, k = qkv[:, rows, 0].transpose(1, 2), qkv[:, columns, 1].transpose(1, 2)
+        logits = (q @ k.transpose(2, 3)).float() / math.sqrt(width // self.heads)
+        return logits.log_softmax(-1).logsumexp(1) - math.log(self.heads)
 
 
 class Extractor(nn.Module):
@@ -115,20 +129,77 @@ def residual(dimensions: int, blocks: Sequence[int], channels: int) -> tuple[nn.
 
 
 def each_trio(
-    score: Callable[[Tensor, Tensor], Tensor], goals: Tensor, asked: Tensor, at_once: int
-) -> Tensor:
-    """Scores (B, G, N) of a body that looks at subject, reference and query together.
+    look: Callable[[Tensor, Tensor], Answer], goals: Tensor, asked: Tensor, at_once: int
+) -> Answer:
+    """The answer of a body that looks at subject, reference and query together.
 
-    `score` gives (T,) for the scenes (T,) and the places (T, 3) in them of T trios, at most
+    `look` answers for the scenes (T,) and the places (T, 3) in them of T trios, at most
     `at_once` of them; what is not `asked` (B, G, N) costs nothing and scores 0.
     """
     none = torch.zeros(asked.shape, device=goals.device)
     places = scene_T, goal_T, query_T = asked.nonzero(as_tuple=True)
     if not len(scene_T):
-        return none
+        return Answer(scores=none)
     trios_T3 = torch.cat([goals[scene_T, goal_T], query_T[:, None]], dim=1)
     parts = zip(scene_T.split(at_once), trios_T3.split(at_once), strict=True)
-    return none.index_put(places, torch.cat([score(*part) for part in parts]).float())
+    answers = [look(*part) for part in parts]
+    scores = none.index_put(places, torch.cat([answer.scores for answer in answers]).float())
+    return Answer(scores=scores, sight=_joined([a.sight for a in answers if a.sight]))
+
+
+def answer_trios(
+    head: Extractor,
+    taught: Taught | None,
+    tokens: Tensor,
+    scene: Tensor,
+    trios: Tensor,
+    attention: Tensor | None = None,
+) -> Answer:
+    """Scores (T,) from embeddings (T, 3, D) of the trios (T, 3), and in training what they say."""
+    sight = None
+    if taught is not None and taught.training:
+        sight = taught(tokens, scene[:, None], trios, attention)
+    return Answer(scores=head.of_trios(tokens), sight=sight)
+
+
+def _joined(sights: Sequence[Sight]) -> Sight | None:
+    """All looks as one; None when there are none."""
+    if not sights:
+        return None
+    seen = [sight.attention for sight in sights if sight.attention is not None]
+    return Sight(
+        scene=torch.cat([sight.scene for sight in sights]),
+        place=torch.cat([sight.place for sight in sights]),
+        geometry=torch.cat([sight.geometry for sight in sights]),
+        match=torch.cat([sight.match for sight in sights]),
+        attention=torch.cat(seen) if seen else None,
+        grid=sights[0].grid,
+    )
+
+
+class Taught(nn.Module):
+    """What an object's embedding says of it, so that masks and poses can teach it to look."""
+
+    def __init__(self, width: int, camera: Camera) -> None:
+        super().__init__()
+        self.grid = camera.height // PATCH, camera.width // PATCH
+        self.geometry = nn.Sequential(
+            nn.Linear(width, width), nn.GELU(), nn.Linear(width, GEOMETRY)
+        )
+        self.match = nn.Linear(width, math.prod(self.grid))
+
+    def forward(
+        self, tokens: Tensor, scene: Tensor, place: Tensor, attention: Tensor | None = None
+    ) -> Sight:
+        """From embeddings (..., D) of the objects at these places (...) of scenes (...)."""
+        return Sight(
+            scene=scene.expand_as(place).flatten(),
+            place=place.flatten(),
+            geometry=self.geometry(tokens).flatten(0, -2),
+            match=self.match(tokens).flatten(0, -2),
+            attention=None if attention is None else attention.flatten(0, -2),
+            grid=self.grid,
+        )
 
 
 def pick(x: Tensor, index: Tensor) -> Tensor:

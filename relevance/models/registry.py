@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from relevance.models.config import Encoding, ModelConfig, ModelError
+from relevance.models.config import Answer, Encoding, ModelConfig, ModelError
 from relevance.registry import Registry
 from relevance.scene import PREDICATES, Predicate
 
@@ -43,8 +43,8 @@ class Body(nn.Module, ABC):
     @abstractmethod
     def decode(
         self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
-    ) -> Tensor:
-        """As `RelevanceModel.decode`; what is not `asked` need not be scored."""
+    ) -> Answer:
+        """As `RelevanceModel.answer`; what is not `asked` need not be scored."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,9 +132,19 @@ class RelevanceModel(nn.Module):
         goals: Tensor,
         asked: Tensor | None = None,
     ) -> Tensor:
-        """Scores (B, G, N), float32 logits, for goals (B, G, 2): subject and reference index.
+        """Scores (B, G, N), float32 logits, of what `answer` is asked."""
+        return self.answer(encoding, predicate, goals, asked).scores
 
-        `asked` (B, G, N) bool says which of them are wanted (None: of all objects that are
+    def answer(
+        self,
+        encoding: Encoding,
+        predicate: Predicate | str,
+        goals: Tensor,
+        asked: Tensor | None = None,
+    ) -> Answer:
+        """The answer to goals (B, G, 2): subject and reference, by place in the scene.
+
+        `asked` (B, G, N) bool says which scores are wanted (None: of all objects that are
         there); the others mean nothing, and cost nothing where nothing is shared between queries.
         Raises ModelError for a predicate that has no head here.
         """
@@ -146,7 +156,8 @@ class RelevanceModel(nn.Module):
         if asked is None:
             asked = encoding.present[:, None].expand(-1, goals.shape[1], -1)
         asked = asked.to(goals.device)
-        return self.body.decode(encoding, PREDICATES[name], goals, asked).float()
+        answer = self.body.decode(encoding, PREDICATES[name], goals, asked)
+        return replace(answer, scores=answer.scores.float())
 
 
 def model_config(values: Any) -> Any:

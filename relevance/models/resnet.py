@@ -18,8 +18,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from relevance.configs import config
-from relevance.models.config import Encoding, ModelConfig
-from relevance.models.layers import Extractor, each_trio, extractor, residual
+from relevance.models.config import Answer, Encoding, ModelConfig
+from relevance.models.layers import (
+    Extractor,
+    Taught,
+    answer_trios,
+    each_trio,
+    extractor,
+    residual,
+)
 from relevance.models.registry import BODIES, Body, BodyKind
 from relevance.scene import Predicate
 
@@ -47,6 +54,8 @@ class ResnetConfig(ModelConfig):
     """D, width of the embeddings of subject, reference and query."""
     hidden: Annotated[int, Field(ge=1)] = 512
     """Width of the two hidden layers of each predicate's extractor (the paper's)."""
+    taught: bool = False
+    """Whether embeddings say where their objects are, so that masks and poses can teach them."""
 
     @classmethod
     def smoke(cls) -> Self:
@@ -59,6 +68,11 @@ class ResnetConfig(ModelConfig):
             width=16,
             hidden=32,
         )
+
+    @classmethod
+    def fair(cls) -> Self:
+        """Sizes that a CPU can train, taught by masks and poses."""
+        return cls(taught=True)
 
     @classmethod
     def paper(cls) -> Self:
@@ -85,6 +99,7 @@ class ResnetBody(Body):
         self.from_role = nn.ModuleList(
             nn.Linear(view_C, 3 * config.width, bias=False) for _ in range(3)
         )
+        self.taught = Taught(config.width, config.camera) if config.taught else None
         self.heads = nn.ModuleDict(
             {name: Extractor(config.width, config.hidden) for name in predicates}
         )
@@ -98,20 +113,21 @@ class ResnetBody(Body):
 
     def decode(
         self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
-    ) -> Tensor:
-        """As `RelevanceModel.decode`."""
+    ) -> Answer:
+        """As `RelevanceModel.answer`."""
+        head = extractor(self.heads, predicate.name)
         assert encoding.scene is not None
         scene_BE = self.from_scene(encoding.scene)
         roles_BNE = [part(encoding.tokens) for part in self.from_role]
 
-        def score(scene_T: Tensor, trios_T3: Tensor) -> Tensor:
+        def look(scene_T: Tensor, trios_T3: Tensor) -> Answer:
             places = zip(roles_BNE, trios_T3.unbind(1), strict=True)
             parts = [scene_BE[scene_T], *(role[scene_T, place] for role, place in places)]
             dense_TE = F.relu(torch.stack(parts).sum(0))
-            head = extractor(self.heads, predicate.name)
-            return head.of_trios(dense_TE.unflatten(-1, (3, self.width)))
+            tokens_T3D = dense_TE.unflatten(-1, (3, self.width))
+            return answer_trios(head, self.taught, tokens_T3D, scene_T, trios_T3)
 
-        return each_trio(score, goals, asked, _AT_ONCE)
+        return each_trio(look, goals, asked, _AT_ONCE)
 
 
 BODIES.register("resnet", BodyKind(config=ResnetConfig, make=ResnetBody, version="1"))

@@ -17,8 +17,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from relevance.configs import config
-from relevance.models.config import PATCH, Encoding, ModelConfig
-from relevance.models.layers import Extractor, each_trio, extractor, residual
+from relevance.models.config import PATCH, Answer, Encoding, ModelConfig
+from relevance.models.layers import (
+    Extractor,
+    Taught,
+    answer_trios,
+    each_trio,
+    extractor,
+    residual,
+)
 from relevance.models.registry import BODIES, Body, BodyKind
 from relevance.scene import Predicate
 
@@ -42,11 +49,18 @@ class Resnet3dConfig(ModelConfig):
     """D, width of the embeddings of subject, reference and query."""
     hidden: Annotated[int, Field(ge=1)] = 512
     """Width of the two hidden layers of each predicate's extractor (the paper's)."""
+    taught: bool = False
+    """Whether embeddings say where their objects are, so that masks and poses can teach them."""
 
     @classmethod
     def smoke(cls) -> Self:
         """The smallest that runs."""
         return cls(blocks=(1,), width=16, hidden=32)
+
+    @classmethod
+    def fair(cls) -> Self:
+        """Sizes that a CPU can train, taught by masks and poses."""
+        return cls(taught=True)
 
     @classmethod
     def paper(cls) -> Self:
@@ -62,6 +76,7 @@ class Resnet3dBody(Body):
         self.width = config.width
         self.net, channels = residual(3, config.blocks, config.channels)
         self.dense = nn.Linear(channels, 3 * config.width)
+        self.taught = Taught(config.width, config.camera) if config.taught else None
         self.heads = nn.ModuleDict(
             {name: Extractor(config.width, config.hidden) for name in predicates}
         )
@@ -75,19 +90,20 @@ class Resnet3dBody(Body):
 
     def decode(
         self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
-    ) -> Tensor:
-        """As `RelevanceModel.decode`."""
+    ) -> Answer:
+        """As `RelevanceModel.answer`."""
+        head = extractor(self.heads, predicate.name)
         patches_BPX, views_BNX = encoding.scene, encoding.tokens
         assert patches_BPX is not None
 
-        def score(scene_T: Tensor, trios_T3: Tensor) -> Tensor:
+        def look(scene_T: Tensor, trios_T3: Tensor) -> Answer:
             stack = torch.cat([patches_BPX[scene_T], views_BNX[scene_T[:, None], trios_T3]], dim=1)
             pictures = stack.unflatten(-1, (3, PATCH, PATCH)).transpose(1, 2)
-            dense = F.relu(self.dense(self.net(pictures)))
-            head = extractor(self.heads, predicate.name)
-            return head.of_trios(dense.unflatten(-1, (3, self.width)))
+            dense_TE = F.relu(self.dense(self.net(pictures)))
+            tokens_T3D = dense_TE.unflatten(-1, (3, self.width))
+            return answer_trios(head, self.taught, tokens_T3D, scene_T, trios_T3)
 
-        return each_trio(score, goals, asked, _AT_ONCE)
+        return each_trio(look, goals, asked, _AT_ONCE)
 
 
 BODIES.register("resnet3d", BodyKind(config=Resnet3dConfig, make=Resnet3dBody, version="1"))

@@ -21,6 +21,7 @@ from relevance.training.checkpoints import (
     newest_checkpoint,
     pick_device,
     save_checkpoint,
+    shipped,
     write_row,
 )
 from relevance.training.examples import (
@@ -33,6 +34,7 @@ from relevance.training.examples import (
 )
 from relevance.training.losses import batch_loss, relevance_loss
 from relevance.training.settings import TRAINER_VERSION, TrainConfig
+from relevance.training.shipping import ship
 from relevance.training.speed import Speed, measure_speed
 from relevance.training.trainer import Trainer, TrainingError, measure, train, use_bfloat16
 
@@ -61,6 +63,8 @@ __all__ = [
     "polling",
     "relevance_loss",
     "save_checkpoint",
+    "ship",
+    "shipped",
     "train",
     "use_bfloat16",
     "write_row",

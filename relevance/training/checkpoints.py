@@ -71,9 +71,10 @@ def load_checkpoint(
 ) -> tuple[RelevanceModel, dict[str, Any]]:
     """Read a model, ready to score, and what is known of it (id, config, metrics, history).
 
-    Raises CheckpointError in one line for anything but a whole file of this version.
+    The name of a model that comes with the package (see `shipped`) serves as a path. Raises
+    CheckpointError in one line for anything but a whole file of this version.
     """
-    path = locate(path)
+    path = named(path)
     where = pick_device(device) if isinstance(device, str) else device
     content = read_file(path, "checkpoint", where)
     try:
@@ -92,6 +93,20 @@ def load_checkpoint(
         if not torch.isfinite(values).all():
             raise CheckpointError(f"{path}: {name}: {weight} is not finite, expected numbers")
     return model.to(where).eval(), meta
+
+
+def named(path: str | Path) -> Path:
+    """The file, where there is one, else the model of that name that comes with the package."""
+    file = locate(path)
+    return file if file.exists() else shipped().get(str(path), file)
+
+
+def shipped() -> dict[str, Path]:
+    """The models that come with the package, by name."""
+    package = Path(__file__).parents[1]
+    installed, checkout = package / "shipped", package.parent / "data" / "models"
+    folder = installed if installed.is_dir() else checkout
+    return {file.stem: file for file in sorted(folder.glob("*.pt"))}
 
 
 def write_file(path: Path, kind: str, content: Mapping[str, Any]) -> None:
@@ -189,10 +204,10 @@ def find_checkpoint(root: str | Path, text: str | Path | None = None) -> Path:
     rows = {row["checkpoint_id"]: row for row in dataset.read_rows("checkpoints")}
     if str(text) in rows:
         return dataset.path / rows[str(text)]["path"]
-    path = locate(text)
+    path = named(text)
     if path.is_file():
         return path
-    known = ", ".join(rows) or "none: nothing was trained yet"
+    known = ", ".join([*rows, *shipped()]) or "none: nothing was trained yet"
     raise DatasetError(
         f"{dataset.path}: unknown checkpoint {str(text)!r}, expected a file or one of {known}"
     )

@@ -1,16 +1,18 @@
-"""What is minimised: the paper's weighted cross entropy, and two losses that teach to look.
+"""What is minimised: the paper's weighted cross entropy, and losses that teach to look.
 
-Shape suffixes: B scenes, N objects (padded), G goals, h and w height and width of the stride-4
-feature map. Tensors here are small and keep plain names; their shapes are in the docstrings.
+Shape suffixes: B scenes, N objects (padded), G goals, K looks at objects, P cells of a grid over
+the image. Tensors here are small and keep plain names; their shapes are in the docstrings.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from relevance.models import GEOMETRY, RelevanceModel
+from relevance.models import GEOMETRY, RelevanceModel, Sight
 from relevance.training.examples import Batch
 from relevance.training.settings import TrainConfig
 
@@ -19,20 +21,25 @@ def batch_loss(model: RelevanceModel, batch: Batch, config: TrainConfig) -> dict
     """The loss of a batch and its parts; every scene is encoded once for all its goals."""
     encoding = model.encode(batch.image, batch.views, batch.present, batch.geometry)
     parts: dict[str, Tensor] = {}
-    terms = []
+    terms, sights = [], [encoding.sight]
     for predicate, goals, relevant, labelled in batch.turns:
         if not config.goal_objects:
             objects = torch.arange(labelled.shape[-1], device=goals.device)
             labelled = labelled & (objects != goals[..., None]).all(-2)
-        scores = model.decode(encoding, predicate, goals, labelled)
-        terms.append(relevance_loss(scores, relevant, labelled, config.eta(predicate)))
+        answer = model.answer(encoding, predicate, goals, labelled)
+        terms.append(relevance_loss(answer.scores, relevant, labelled, config.eta(predicate)))
+        sights.append(answer.sight)
     parts["relevance"] = torch.stack(terms).mean()
     loss = config.relevance_weight * parts["relevance"]
-    if encoding.match is not None and encoding.geometry is not None:
-        parts["mask"] = _mask_loss(encoding.match, batch)
-        parts["geometry"] = _geometry_loss(encoding.geometry, batch)
-        loss = loss + config.mask_weight * parts["mask"]
-        loss = loss + config.geometry_weight * parts["geometry"]
+    parts |= _look_losses([sight for sight in sights if sight], batch)
+    weights = {
+        "mask": config.mask_weight,
+        "attention": config.mask_weight,
+        "geometry": config.geometry_weight,
+    }
+    for name, weight in weights.items():
+        if name in parts and weight:
+            loss = loss + weight * parts[name]
     return {"loss": loss, **parts}
 
 
@@ -49,18 +56,34 @@ def relevance_loss(scores: Tensor, relevant: Tensor, mask: Tensor, eta: float) -
     return -(terms * weight).sum() / weight.sum().clamp(min=1)
 
 
-def _mask_loss(match: Tensor, batch: Batch) -> Tensor:
-    """Cross entropy between where an object was matched and where the mask shows it."""
-    number = torch.arange(1, match.shape[1] + 1, device=match.device)[:, None]
-    there = (batch.cells.flatten(1)[:, None] == number) & batch.present[..., None]
-    count = there.sum(-1)
-    each = -(match.log_softmax(-1) * there).sum(-1) / count.clamp(min=1)
-    return each.sum() / (count > 0).sum().clamp(min=1)
+def _look_losses(sights: Sequence[Sight], batch: Batch) -> dict[str, Tensor]:
+    """How far from masks and poses objects were seen, the mean over all looks.
+
+    mask, attention: cross entropy between where an object was seen and where the mask shows it.
+    geometry: smooth L1 in decimetres, position, size and half-extents weighing the same.
+    """
+    found: dict[str, list[Tensor]] = {}
+    for sight in sights:
+        at = sight.scene, sight.place
+        shown = _shown(batch, sight.grid)[at]
+        found.setdefault("mask", []).append(_mask_loss(sight.match, shown))
+        if sight.attention is not None:
+            found.setdefault("attention", []).append(_mask_loss(sight.attention, shown))
+        error = F.smooth_l1_loss(sight.geometry, batch.geometry[at], beta=0.1, reduction="none")
+        parts = [error[:, a:b].mean() for a, b in ((0, 3), (3, 6), (6, GEOMETRY))]
+        found.setdefault("geometry", []).append(torch.stack(parts).sum())
+    return {name: torch.stack(values).mean() for name, values in found.items()}
 
 
-def _geometry_loss(geometry: Tensor, batch: Batch) -> Tensor:
-    """Smooth L1 in decimetres, position, size and half-extents weighing the same."""
-    error = F.smooth_l1_loss(geometry, batch.geometry, beta=0.1, reduction="none")
-    parts = [error[..., a:b].mean(-1) for a, b in ((0, 3), (3, 6), (6, GEOMETRY))]
-    each = torch.stack(parts).sum(0) * batch.present
-    return each.sum() / batch.present.sum().clamp(min=1)
+def _shown(batch: Batch, grid: tuple[int, int]) -> Tensor:
+    """How much of each cell of a grid over the image shows each object, (B, N, P)."""
+    number = torch.arange(1, batch.present.shape[1] + 1, device=batch.cells.device)
+    there = batch.cells[:, None] == number[:, None, None]
+    return F.adaptive_avg_pool2d(there.float(), grid).flatten(2)
+
+
+def _mask_loss(match: Tensor, shown: Tensor) -> Tensor:
+    """Cross entropy of logits (K, P) against shares (K, P); objects that are hidden left out."""
+    total = shown.sum(-1)
+    each = -(match.float().log_softmax(-1) * shown).sum(-1) / total.clamp(min=1e-6)
+    return each.sum() / (total > 0).sum().clamp(min=1)
