@@ -21,6 +21,7 @@ from relevance.store.paths import (
     sweep,
 )
 from relevance.store.queries import sql
+from relevance.store.streaming import polled, shuffled
 from relevance.store.synthetic import synthetic_labels
 from relevance.store.tables import (
     SCHEMAS,
@@ -56,7 +57,9 @@ __all__ = [
     "file_hash",
     "is_remote",
     "locate",
+    "polled",
     "replacing",
+    "shuffled",
     "sql",
     "sweep",
     "synthetic_labels",
