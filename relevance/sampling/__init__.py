@@ -15,6 +15,7 @@ row's hash.
 """
 
 from relevance.sampling.goals import sample_goals
+from relevance.sampling.looks import same_view, view_of
 from relevance.sampling.scenes import sample_scene
 from relevance.sampling.settings import (
     SAMPLER_VERSION,
@@ -28,6 +29,8 @@ __all__ = [
     "GoalConfig",
     "Randomisation",
     "SceneConfig",
+    "same_view",
     "sample_goals",
     "sample_scene",
+    "view_of",
 ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import islice
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from relevance.errors import RelevanceError
 
@@ -28,7 +28,8 @@ def shuffled(
 ) -> Iterator[Any]:
     """What is in the shards: these in an order of `seed`, then each drawn from a buffer."""
     # Here and not above: importing webdataset loads torch, which making shards does not need.
-    from webdataset import DataPipeline, detshuffle
+    from webdataset.filters import detshuffle
+    from webdataset.pipeline import DataPipeline
 
     def samples(order: Iterable[Shard]) -> Iterator[Any]:
         return (sample for shard in order for sample in taken_apart(shard))
@@ -49,7 +50,11 @@ def polled(
 
     0 workers: all is done here. What a user can mend is raised here, where it would have come.
     """
-    from webdataset import DataPipeline, RoundRobin, WebLoader, map, split_by_worker
+    from webdataset.compat import WebLoader
+    from webdataset.filters import map
+    from webdataset.mix import RoundRobin
+    from webdataset.pipeline import DataPipeline
+    from webdataset.shardlists import split_by_worker
 
     def some(source: Iterable[Any]) -> Iterator[Any]:
         return islice(source, count)
@@ -60,7 +65,9 @@ def polled(
         except RelevanceError as error:  # torch would make a traceback of its one line
             yield error
 
-    pipeline = DataPipeline(RoundRobin(list(streams)), some, split_by_worker, map(finish), named)
+    pipeline = DataPipeline(
+        RoundRobin(cast(Any, streams)), some, split_by_worker, map(finish), named
+    )
     # Forked, workers have all that is here; what is not safe in a fork they open anew.
     how: dict[str, Any] = {"multiprocessing_context": "fork"} if workers else {}
     for found in WebLoader(pipeline, batch_size=None, num_workers=workers, **how):

@@ -30,9 +30,9 @@ from relevance.training.examples import Answer, Batch, Example, batch_of
 from relevance.training.losses import batch_loss, relevance_loss
 from relevance.training.polling import polling
 from relevance.training.ranks import Ranks
-from relevance.training.reading import Reader
+from relevance.training.reading import Reader, TrainingError
 from relevance.training.settings import TRAINER_VERSION, TrainConfig
-from relevance.training.trainer import Trainer, TrainingError, measure, train, use_bfloat16
+from relevance.training.trainer import Trainer, measure, train, use_bfloat16
 
 __all__ = [
     "CHECKPOINT_VERSION",

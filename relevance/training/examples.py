@@ -6,7 +6,7 @@ pixels, h and w the same at stride 4.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -15,8 +15,12 @@ import torch
 from torch import Tensor
 
 from relevance.models import GEOMETRY, PATCH, STRIDE, mirrored, true_geometry
+from relevance.sampling import Randomisation, same_view, view_of
 from relevance.scene import PREDICATES, Camera, Predicate, Scene, scene_from_json
 from relevance.store import DatasetError, Sample, decode
+
+_RANDOM = Randomisation(camera_shift=0.03, camera_fov=2.0)
+"""As far as cameras can be drawn from the one that a model is told of."""
 
 
 class Answer(NamedTuple):
@@ -77,14 +81,29 @@ class Batch:
             self,
             image=self.image.to(device),
             views=self.views.to(device),
-            present=self.present.to(device),
-            cells=self.cells.to(device),
-            geometry=self.geometry.to(device),
-            turns=tuple(
-                (p, goals.to(device), relevant.to(device), labelled.to(device))
-                for p, goals, relevant, labelled in self.turns
-            ),
+            **_numbers(self, lambda tensor: tensor.to(device)),
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # From worker to trainer: torch shares tensors by a file each, which pays for pictures.
+        return _received, (self.image, self.views, _numbers(self, Tensor.numpy))
+
+
+def _received(image: Tensor, views: Tensor, numbers: dict[str, Any]) -> Batch:
+    batch = Batch(image=image, views=views, **numbers)
+    return replace(batch, **_numbers(batch, torch.from_numpy))
+
+
+def _numbers(batch: Batch, change: Callable[[Any], Any]) -> dict[str, Any]:
+    """What of a batch is no picture, each tensor changed."""
+    return {
+        "present": change(batch.present),
+        "cells": change(batch.cells),
+        "names": batch.names,
+        "families": batch.families,
+        "geometry": change(batch.geometry),
+        "turns": tuple((turn[0], *map(change, turn[1:])) for turn in batch.turns),
+    }
 
 
 def batch_of(
@@ -133,6 +152,11 @@ def _check(example: Example, scene: Scene, camera: Camera) -> None:
         raise DatasetError(
             f"{example.members['__url__']}: scene {example.name}: image is "
             f"{its.width}x{its.height}, expected {camera.width}x{camera.height}"
+        )
+    if not same_view(its, camera, _RANDOM):
+        raise DatasetError(
+            f"{example.members['__url__']}: scene {example.name}: seen from {view_of(its)}, "
+            f"expected the model's camera, {view_of(camera)}"
         )
 
 

@@ -8,7 +8,7 @@ that goes on begins where it was: what was consumed is passed over undecoded.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, count, islice
@@ -16,6 +16,7 @@ from itertools import chain, count, islice
 import numpy as np
 import torch
 
+from relevance.errors import RelevanceError
 from relevance.scene import PREDICATES, Predicate
 from relevance.store import polled, shuffled
 from relevance.training.catalogue import Catalogue, Shard
@@ -30,6 +31,11 @@ from relevance.training.examples import (
 )
 from relevance.training.polling import looks_of, polling
 from relevance.training.settings import TrainConfig
+
+
+class TrainingError(RelevanceError):
+    """A run that cannot go on: says at which step, on which scenes."""
+
 
 SCENES, QUERIES = 1000, 20_000
 """Scenes, or single queries, from which a shuffled one is drawn."""
@@ -61,14 +67,21 @@ class Reader:
     rank: int = 0
     ranks: int = 1
 
-    def steps(self, first: int = 0) -> Iterator[list[Batch]]:
+    def __post_init__(self) -> None:
+        size, what = self.config.scenes_per_batch, "scenes"
+        if self.config.queries_per_batch:
+            size, what = self.config.queries_per_batch, "queries"
+        if size < self.ranks:
+            raise TrainingError(
+                f"{size} {what} a batch for {self.ranks} processes, expected at least one each"
+            )
+
+    def steps(self, first: int = 0) -> Generator[list[Batch]]:
         """What each step learns from, from step `first` to the last of the run."""
         groups, last = self.catalogue.groups, self.config.steps - 1
         begin = looks_of(first, groups, self.config)[0][0]
         end = looks_of(last, groups, self.config)[-1][0] + 1
-        looks = polled(
-            self._streams(begin), self._learned, count=end - begin, workers=self.workers
-        )
+        looks = polled(self._streams(begin), self._learned, count=end - begin, workers=self.workers)
         ahead = enumerate(looks, begin)
         at, batch = next(ahead)
         for step in range(first, self.config.steps):

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from relevance.errors import RelevanceError
 from relevance.metrics import accuracy
 from relevance.models import RelevanceModel
 from relevance.scene import PREDICATES, Predicate
@@ -40,14 +39,10 @@ from relevance.training.checkpoints import (
 from relevance.training.examples import Batch
 from relevance.training.losses import batch_loss
 from relevance.training.ranks import ALONE, Ranks, together
-from relevance.training.reading import Reader
+from relevance.training.reading import Reader, TrainingError
 from relevance.training.settings import TrainConfig
 
 Progress = Callable[[int, int], None]
-
-
-class TrainingError(RelevanceError):
-    """A run that cannot go on: says at which step, on which scenes."""
 
 
 class Trainer:
