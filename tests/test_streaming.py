@@ -109,7 +109,7 @@ def test_the_order_is_the_same_for_any_workers_and_wherever_a_run_goes_on(
 ) -> None:
     whole = list(reader(made, config).steps())
     assert len(whole) == config.steps
-    for first, workers in ((0, 1), (0, 3), (3, 0), (config.steps - 1, 2)):
+    for first, workers in ((0, 1), (0, 2), (3, 0), (config.steps - 1, 2)):
         again = list(reader(made, config, workers=workers).steps(first))
         assert names(again) == names(whole[first:])
         batches = [[b for step in steps for b in step] for steps in (again, whole[first:])]
@@ -195,7 +195,7 @@ def test_batches_are_the_stored_scenes_and_labels(made: Path) -> None:
                     for g, q in labelled[b].nonzero().tolist()
                 }
                 assert found == expected
-    assert seen == Counter(samples), "each once"
+    assert seen == Counter([*samples]), "each once"
 
 
 KEYS = ("subject", "reference", "query")
