@@ -7,6 +7,7 @@ again ends with the same weights as one that was not; there is no sampler state 
 from __future__ import annotations
 
 import math
+import multiprocessing
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -280,13 +281,13 @@ def _check(dataset: Dataset, catalogue: Catalogue, config: TrainConfig) -> None:
     """Raise DatasetError unless there is something to learn for all that is asked for."""
     names = {predicate.name for predicate in catalogue.predicates}
     where = f"with split train and policy {config.policy}"
-    if not names:
-        raise DatasetError(
-            f"{dataset.path}: no labels {where}, expected at least one labelled goal"
-        )
     if lacking := set(config.predicates) - names:
         raise DatasetError(
             f"{dataset.path}: no labels of {min(lacking)} {where}, which the settings ask for"
+        )
+    if not names:
+        raise DatasetError(
+            f"{dataset.path}: no labels {where}, expected at least one labelled goal"
         )
 
 
@@ -310,6 +311,8 @@ def _reader(catalogue: Catalogue, trainer: Trainer) -> Reader:
     ahead = trainer.config.workers
     if ahead is None:
         ahead = 1 if trainer.device.type == "cpu" else min(8, max(1, (os.cpu_count() or 2) - 1))
+    if multiprocessing.current_process().daemon:
+        ahead = 0  # Dask's workers may not have processes of their own
     return Reader(
         catalogue=catalogue,
         config=trainer.config,
