@@ -36,9 +36,9 @@ from relevance.metrics import (
     calibration_error,
 )
 from relevance.models import BODIES, RelevanceModel
-from relevance.scene import Camera, Goal, Robot
+from relevance.scene import Goal, Robot
 from relevance.store import Dataset
-from relevance.training import load_checkpoint, load_examples, save_checkpoint, train
+from relevance.training import Catalogue, load_checkpoint, save_checkpoint, train
 from relevance.training.decision import offsets
 from relevance.training.soft import target, tied_sets
 
@@ -349,12 +349,21 @@ def test_two_sets_that_tie_share_the_target() -> None:
 
 def test_targets_are_shares_where_sets_tie_and_labels_elsewhere(tmp_path) -> None:
     dataset = Dataset.open(tied(tmp_path))
-    soft = load_examples(dataset, "train", camera=Camera(), soft=True)
-    hard = load_examples(dataset, "train", camera=Camera())
-    for predicate, goals in soft.goals.items():
-        changed = goals.relevant != hard.goals[predicate].relevant
-        assert set(np.unique(goals.relevant[changed])) == {0.5}
-        assert np.array_equal(goals.labelled, hard.goals[predicate].labelled)
+    shares = [
+        [
+            answer
+            for shard in catalogue.shards
+            for example in catalogue.read(shard, catalogue.predicates)
+            for answers in example.answers.values()
+            for answer in answers
+        ]
+        for yes in (True, False)
+        for catalogue in [Catalogue.of(dataset, "train", replace(TRAINING, soft_labels=yes))]
+    ]
+    changed = {s.relevant for s, h in zip(*shares, strict=True) if s.relevant != h.relevant}
+    assert changed == {0.5}
+    assert all(s[:3] == h[:3] for s, h in zip(*shares, strict=True))
+    assert {answer.relevant for answer in shares[1]} == {0.0, 1.0}
 
 
 def test_soft_labels_are_learned_and_the_loss_stays_a_number(tmp_path) -> None:

@@ -21,15 +21,16 @@ from ruled import ruled, shards_of_family
 from relevance.errors import RelevanceError
 from relevance.models import ModelError, RelevanceModel
 from relevance.models.glimpse import GlimpseConfig
-from relevance.scene import PREDICATES, Camera
+from relevance.scene import PREDICATES
 from relevance.store import Dataset, DatasetError
 from relevance.training import (
+    Catalogue,
     CheckpointError,
+    Reader,
     TrainConfig,
     checkpoint_id,
     find_checkpoint,
     load_checkpoint,
-    load_examples,
     measure,
     newest_checkpoint,
     pick_device,
@@ -83,8 +84,10 @@ def test_train_writes_a_checkpoint_and_its_row(root: Path) -> None:
     assert TrainConfig.from_dict(meta["config"]) == CONFIG
     assert meta["metrics"] == json.loads(row["metrics"])
     assert set(meta["metrics"]) == {*(p.name for p in PREDICATES.values()), "same-plane"}
-    validation = load_examples(dataset, "validation", camera=Camera())
-    assert measure(model, validation) == meta["metrics"], "the file holds the trained weights"
+    validation = Reader(catalogue=Catalogue.of(dataset, "validation", CONFIG), config=CONFIG)
+    assert measure(model, validation.whole()) == meta["metrics"], (
+        "the file holds the trained weights"
+    )
     assert [entry["step"] for entry in meta["history"]] == [1, 2, 3, 4, 5, 6]
     stamp = path.stat().st_mtime_ns
     assert train(root, CONFIG) == path
@@ -97,7 +100,7 @@ def test_train_writes_a_checkpoint_and_its_row(root: Path) -> None:
 def test_identity_is_the_config_and_the_data_but_not_the_execution(root: Path) -> None:
     config = replace(CONFIG, steps=1)
     path = train(root, config)
-    assert train(root, replace(config, threads=2, save_every=7, cache_bytes=0)) == path
+    assert train(root, replace(config, threads=2, save_every=7, workers=0)) == path
     assert train(root, replace(config, seed=1)) != path
     assert not equal(weights(path), weights(train(root, replace(config, seed=1))))
     dataset = Dataset.open(root)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ruled import ruled
 
 from relevance.cli import main
 from relevance.pipeline import (
@@ -25,6 +26,7 @@ from relevance.pipeline import (
 )
 from relevance.pipeline.checking import check
 from relevance.store import Dataset, DatasetError, locate, replacing, sql
+from relevance.training import Catalogue, Reader, TrainConfig
 
 FEW = {
     "train.same_plane": 0,
@@ -117,6 +119,30 @@ def test_an_object_store_holds_the_same_bytes(bucket: str, calm: Path) -> None:
     assert [of.policy for of in Dataset.open(root).labellings()] == ["any-minimal"]
     _, [(n, m)] = sql(root, "select (select count(*) from labels), count(*) from beside_labels")
     assert n == m > 0
+
+
+@pytest.mark.slow  # a server of objects
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_trainer_reads_there_what_it_reads_here(bucket: str, workers: int) -> None:
+    here, there = ruled(), f"{bucket}/trained-{workers}"
+    locate(there).fs.put(str(here), there, recursive=True)  # type: ignore[attr-defined]
+    config = TrainConfig(steps=8, scenes_per_batch=3)
+    read = [
+        Reader(
+            catalogue=Catalogue.of(Dataset.open(root), "train", config),
+            config=config,
+            workers=workers,
+        )
+        for root in (here, there)
+    ]
+    steps = list(zip(*(own.steps(first=2) for own in read), strict=True))
+    assert len(steps) == 6
+    for [a], [b] in steps:
+        assert a.names == b.names
+        assert (a.image == b.image).all()
+        for (p, *mine), (q, *its) in zip(a.turns, b.turns, strict=True):
+            assert p is q
+            assert all((x == y).all() for x, y in zip(mine, its, strict=True))
 
 
 @pytest.mark.slow

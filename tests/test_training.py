@@ -1,9 +1,9 @@
-"""Training: polling order, batches by (seed, step), losses, learning, metrics, config."""
+"""Training: recipes, losses, learning, metrics, config."""
 
 from __future__ import annotations
 
 import math
-import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -13,30 +13,24 @@ import pytest
 import torch
 from ruled import ruled
 
-from relevance import training
 from relevance.cli import main
 from relevance.metrics import accuracy
 from relevance.models import BODIES, RelevanceModel
 from relevance.models.geometry import GeometryConfig
 from relevance.models.glimpse import GlimpseConfig
 from relevance.models.vit import VitConfig
-from relevance.scene import PREDICATES, Camera
-from relevance.store import Dataset, DatasetError
+from relevance.scene import PREDICATES
+from relevance.store import Dataset
 from relevance.training import (
+    Batch,
+    Catalogue,
+    Reader,
     TrainConfig,
+    Trainer,
+    TrainingError,
     batch_loss,
-    draw_batch,
-    draw_batches,
     measure,
-    polling,
     relevance_loss,
-)
-from relevance.training.examples import (
-    Examples,
-    gather,
-    in_the_mirror,
-    load_examples,
-    true_geometry,
 )
 
 torch.set_num_threads(1)  # threads that wait for each other crawl on a busy machine
@@ -57,153 +51,25 @@ def made() -> Path:
     return ruled()
 
 
-@pytest.fixture
-def root(made: Path, tmp_path: Path) -> Path:
-    """A copy of its own for a test that writes."""
-    return Path(shutil.copytree(made, tmp_path / "dataset"))
+def reader(root: Path, config: TrainConfig, split: str = "train") -> Reader:
+    return Reader(catalogue=Catalogue.of(Dataset.open(root), split, config), config=config)
 
 
-@pytest.fixture(scope="module")
-def examples(made: Path) -> Examples:
-    return load_examples(Dataset.open(made), "train", camera=Camera())
+def draw_batches(root: Path, config: TrainConfig, step: int) -> list[Batch]:
+    """What a step learns from."""
+    return next(reader(root, config).steps(step))
 
 
-# --- polling and batches ------------------------------------------------------------------
+def draw_batch(root: Path, config: TrainConfig, step: int) -> Batch:
+    """What a step learns from, where it is one batch."""
+    [batch] = draw_batches(root, config, step)
+    return batch
 
 
-def test_polling_takes_the_predicates_in_turn(examples: Examples) -> None:
-    strict = replace(CONFIG, share_encodings=False, mirror=False)
-    seen = [draw_batch(examples, strict, step).turns[0][0] for step in range(12)]
-    assert seen == [*PREDICATES.values(), *PREDICATES.values(), *list(PREDICATES.values())[:2]]
-    shared = replace(strict, share_encodings=True)
-    steps = [[turn[0] for turn in draw_batch(examples, shared, s).turns] for s in range(4)]
-    assert steps == [[*SAME_PLANE], [PREDICATES["on"]]] * 2
-    assert [p for step in steps for p in step] == [*PREDICATES.values(), *PREDICATES.values()]
-
-
-def test_polling_shares_steps_only_among_neighbours_of_a_family() -> None:
-    mixed = [
-        PREDICATES["on-the-left"],
-        PREDICATES["on"],
-        PREDICATES["behind"],
-        PREDICATES["in-front"],
-    ]
-    assert polling(mixed, share=True) == [(mixed[0],), (mixed[1],), (mixed[2], mixed[3])]
-    assert polling(mixed, share=False) == [(p,) for p in mixed]
-
-
-def test_a_predicate_without_labels_is_left_out(root: Path) -> None:
-    shutil.rmtree(root / "labels/predicate=behind")
-    examples = load_examples(Dataset.open(root), "train", camera=Camera())
-    steps = [draw_batch(examples, replace(CONFIG, mirror=False), s).turns for s in range(2)]
-    names = [turn[0].name for turns in steps for turn in turns]
-    assert names == ["on-the-left", "on-the-right", "in-front", "on"]
-
-
-def test_every_scene_comes_before_any_comes_again(examples: Examples) -> None:
-    config = replace(CONFIG, scenes_per_batch=3, mirror=False, recolor=False)
-    for first, own in ((0, examples.scenes(SAME_PLANE)), (1, examples.scenes([PREDICATES["on"]]))):
-        shown: list[int] = []
-        for step in range(first, first + 2 * 2 * len(own), 2):
-            image = draw_batch(examples, config, step).image.permute(0, 2, 3, 1).numpy()
-            for picture in image:
-                match = [i for i in own if np.array_equal(picture, examples.images[i])]
-                assert len(match) == 1
-                shown += match
-        epochs = np.array(shown).reshape(-1, len(own))
-        assert len(epochs) == 6
-        assert (np.sort(epochs, axis=1) == own).all()
-        assert (epochs[0] != epochs[1]).any(), "each epoch has an order of its own"
-
-
-def test_a_batch_depends_on_seed_and_step_alone(examples: Examples) -> None:
-    def same(a: training.Batch, b: training.Batch) -> bool:
-        tensors = [(x.image, x.views, x.geometry, *x.turns[0][1:]) for x in (a, b)]
-        return all(
-            x.shape == y.shape and bool((x == y).all()) for x, y in zip(*tensors, strict=True)
-        )
-
-    batches = [draw_batch(examples, CONFIG, step) for step in range(6)]
-    assert all(same(batches[s], draw_batch(examples, CONFIG, s)) for s in reversed(range(6)))
-    other = replace(CONFIG, seed=1)
-    assert not all(same(batches[s], draw_batch(examples, other, s)) for s in range(6))
-
-
-def test_most_goals_of_a_scene(examples: Examples) -> None:
-    one = replace(CONFIG, goals_per_scene=1)
-    for step in range(4):
-        for _, goals, _, labelled in draw_batch(examples, one, step).turns:
-            assert goals.shape[1] == 1
-            assert labelled.any(-1).all()
-
-
-def test_examples_are_the_stored_scenes_and_labels(made: Path, examples: Examples) -> None:
-    dataset = Dataset.open(made)
-    samples = list(dataset.samples("train"))
-    assert len(examples.images) == len(samples) == 10
-    place = {sample.scene.id: i for i, sample in enumerate(samples)}
-    for i, sample in enumerate(samples):
-        count = len(sample.scene.objects)
-        assert np.array_equal(examples.images[i], sample.image)
-        assert np.array_equal(examples.views[i, :count], sample.views)
-        assert examples.present[i].sum() == count
-        for row, box in zip(examples.geometry[i], sample.scene.objects, strict=False):
-            np.testing.assert_allclose(row[:3] / 10, box.position, atol=1e-6)
-            np.testing.assert_allclose(row[3:6] / 10, box.size, atol=1e-6)
-            np.testing.assert_allclose(row[[6, 10]] / 10, box.extents, atol=1e-6)
-        shown = set(np.unique(examples.cells[i])) - {0}
-        assert shown == set(range(1, count + 1))
-    for predicate in PREDICATES.values():
-        goals = examples.goals[predicate]
-        expected = {}
-        for row in dataset.read_rows("labels", split="train", predicate=predicate.name):
-            names = samples[place[row["scene_id"]]].scene.names
-            key = place[row["scene_id"]], names.index(row["subject"]), names.index(row["reference"])
-            expected.setdefault(key, {})[names.index(row["query"])] = row["relevant"]
-        found = {}
-        for i in range(len(samples)):
-            for k in range(goals.first[i], goals.first[i + 1]):
-                known = np.flatnonzero(goals.labelled[k]).tolist()
-                found[i, *goals.pairs[k].tolist()] = {q: goals.relevant[k, q] for q in known}
-        assert found == expected
-
-
-def test_images_mapped_from_a_file_are_the_same(
-    made: Path, examples: Examples, tmp_path: Path
-) -> None:
-    dataset = Dataset.open(made)
-    mapped = load_examples(dataset, "train", camera=Camera(), cache_bytes=1, folder=tmp_path)
-    assert isinstance(mapped.images, np.memmap)
-    assert np.array_equal(mapped.images, examples.images)
-    assert np.array_equal(mapped.views, examples.views)
-    assert list(tmp_path.iterdir()) == [], "the file has no name, so it cannot be left behind"
-
-
-def test_ambiguous_goals_and_other_policies_can_be_left_out(made: Path, examples: Examples) -> None:
-    dataset = Dataset.open(made)
-    clear = load_examples(dataset, "train", camera=Camera(), ambiguous=False)
-    rows = dataset.read_rows("labels", split="train", predicate="on", ambiguous=False)
-    assert len(clear.goals[PREDICATES["on"]].pairs) == len({row["plan_id"] for row in rows})
-    assert len(clear.goals[PREDICATES["on"]].pairs) < len(examples.goals[PREDICATES["on"]].pairs)
-    with pytest.raises(DatasetError, match="policy 'none': expected one of found"):
-        load_examples(dataset, "train", camera=Camera(), policy="none")
-
-
-def test_the_mirror_shows_the_mirrored_scene(made: Path, examples: Examples) -> None:
-    sample = next(Dataset.open(made).samples("train"))
-    batch = gather(examples, np.array([0]), SAME_PLANE)
-    flipped = in_the_mirror(batch)
-    boxes = tuple(
-        replace(box, position=(box.position[0], -box.position[1], box.position[2]), yaw=-box.yaw)
-        for box in sample.scene.objects
-    )
-    expected = true_geometry(replace(sample.scene, id="", goals=(), objects=boxes))
-    np.testing.assert_allclose(flipped.geometry[0].numpy(), expected, atol=1e-5)
-    assert np.array_equal(flipped.image[0].permute(1, 2, 0).numpy(), sample.image[:, ::-1])
-    names = [turn[0].name for turn in flipped.turns]
-    assert names == ["on-the-right", "on-the-left", "in-front", "behind"]
-    assert torch.equal(flipped.turns[0][2], batch.turns[0][2])
-    assert torch.equal(in_the_mirror(flipped).geometry, batch.geometry)
+def trainer_of(root: Path, config: TrainConfig) -> tuple[Trainer, Iterator[list[Batch]]]:
+    """A trainer and what it learns from."""
+    own = reader(root, config)
+    return Trainer(config, own.catalogue.predicates), own.steps()
 
 
 SMALL = {
@@ -216,58 +82,56 @@ SMALL = {
 # --- recipes ------------------------------------------------------------------------------
 
 
-def test_rounds_have_a_batch_of_each_in_every_step(examples: Examples) -> None:
+def test_rounds_have_a_batch_of_each_in_every_step(made: Path) -> None:
     config = replace(CONFIG, polling="rounds", mirror=False)
-    steps = [draw_batches(examples, config, step) for step in range(3)]
+    steps = [draw_batches(made, config, step) for step in range(3)]
     for batches in steps:
         assert [[turn[0] for turn in b.turns] for b in batches] == [
             [*SAME_PLANE],
             [PREDICATES["on"]],
         ]
-    trainer = training.Trainer(replace(config, model=GlimpseConfig.smoke()), examples)
+    trainer, ahead = trainer_of(made, replace(config, model=GlimpseConfig.smoke()))
     parts = [batch_loss(trainer.model, batch, config)["loss"].item() for batch in steps[0]]
-    assert trainer.step()["loss"] == pytest.approx(np.mean(parts), rel=1e-5)
+    assert trainer.take(ahead)["loss"] == pytest.approx(np.mean(parts), rel=1e-5)
 
 
-def test_one_by_one_trains_each_for_its_share_of_the_steps(examples: Examples) -> None:
+def test_one_by_one_trains_each_for_its_share_of_the_steps(made: Path) -> None:
     config = replace(CONFIG, polling="one-by-one", steps=10, share_encodings=False, mirror=False)
-    seen = [draw_batch(examples, config, step).turns[0][0] for step in range(10)]
+    seen = [draw_batch(made, config, step).turns[0][0] for step in range(10)]
     assert seen == [p for p in PREDICATES.values() for _ in range(2)]
 
 
-def test_queries_are_drawn_uniformly(examples: Examples) -> None:
-    """Each query of a predicate comes as often as any other, whatever its scene or goal has."""
+def test_queries_are_drawn_uniformly(made: Path) -> None:
+    """Each query of a predicate comes once before any comes again, whatever its scene has."""
     config = replace(
-        CONFIG, queries_per_batch=50, goal_objects=False, share_encodings=False,
+        CONFIG, queries_per_batch=7, goal_objects=False, share_encodings=False, steps=100,
         predicates=("behind",), mirror=False, recolor=False,
     )  # fmt: skip
-    goals = examples.goals[PREDICATES["behind"]]
-    only = replace(examples, goals={PREDICATES["behind"]: goals})
-    asked = goals.asked(goal_objects=False)
-    count = np.zeros(asked.shape)
-    name = {scene: i for i, scene in enumerate(examples.names)}
-    for step in range(200):
-        batch = draw_batch(only, config, step)
+    rows = Dataset.open(made).read_rows("labels", split="train", predicate="behind")
+    names = ("scene_id", "subject", "reference", "query")
+    asked = {
+        tuple(row[n] for n in names): row["relevant"] for row in rows if not row["is_goal_object"]
+    }
+    scenes = {s.scene.id: s.scene.names for s in Dataset.open(made).samples("train")}
+    drawn: list[tuple[str, ...]] = []
+    for [batch] in reader(made, config).steps():
         [(_, pairs, relevant, wanted)] = batch.turns
+        assert wanted.sum() <= 7
         for b, g, query in wanted.nonzero().tolist():
-            scene = name[batch.names[b]]
-            [k] = [
-                k
-                for k in range(goals.first[scene], goals.first[scene + 1])
-                if goals.pairs[k].tolist() == pairs[b, g].tolist()
-            ]
-            assert goals.relevant[k, query] == relevant[b, g, query]
-            assert query not in pairs[b, g].tolist()
-            count[k, query] += 1
-    assert (count[~asked] == 0).all()
-    share = 1 - (1 - 1 / asked.sum()) ** 50  # drawn at least once in a batch
-    assert np.abs(count[asked] / 200 - share).max() < 5 * np.sqrt(share * (1 - share) / 200)
+            own = scenes[batch.names[b]]
+            drawn.append((batch.names[b], *(own[i] for i in [*pairs[b, g].tolist(), query])))
+            assert asked[drawn[-1]] == relevant[b, g, query]
+    first = drawn[: len(asked) // 7 * 7]
+    assert len(first) == len({*first}) > 7, "none comes again in the first epoch"
+    count = np.array([drawn.count(query) for query in asked])
+    assert count.sum() == len(drawn) > 5 * len(asked)
+    assert count.min() > 0.8 * count.max(), "drawn twice in one batch, it is asked once"
 
 
-def test_goal_objects_can_be_left_out_of_the_loss(examples: Examples) -> None:
+def test_goal_objects_can_be_left_out_of_the_loss(made: Path) -> None:
     torch.manual_seed(0)
     model = RelevanceModel(VitConfig.smoke())
-    batch = draw_batch(examples, replace(CONFIG, mirror=False), 1)
+    batch = draw_batch(made, replace(CONFIG, mirror=False), 1)
     [(predicate, goals, relevant, labelled)] = batch.turns
     encoding = model.encode(batch.image, batch.views, batch.present)
     scores = model.decode(encoding, predicate, goals)
@@ -280,19 +144,19 @@ def test_goal_objects_can_be_left_out_of_the_loss(examples: Examples) -> None:
     assert found.item() != pytest.approx(batch_loss(model, batch, CONFIG)["relevance"].item())
 
 
-def test_the_bare_recipe_is_plain_adam(examples: Examples) -> None:
+def test_the_bare_recipe_is_plain_adam(made: Path) -> None:
     paper = TrainConfig.paper()
     config = replace(paper, model=VitConfig.smoke(), predicates=(), device="auto", bfloat16="off")
-    trainer = training.Trainer(config, examples)
+    trainer, ahead = trainer_of(made, config)
     assert {trainer.rate(step) for step in (0, 1, 1000, 499_999)} == {1e-5}
     before = [w.detach().clone() for w in trainer.model.parameters()]
     torch.manual_seed(0)
-    plain = training.Trainer(config, examples)
+    plain, _ = trainer_of(made, config)
     adam = torch.optim.Adam(plain.model.parameters(), lr=1e-5)
     for step in range(2):
-        trainer.step()
+        trainer.take(ahead)
         adam.zero_grad()
-        batch_loss(plain.model, draw_batch(examples, config, step), config)["loss"].backward()
+        batch_loss(plain.model, draw_batch(made, config, step), config)["loss"].backward()
         adam.step()
     pairs = zip(trainer.model.parameters(), plain.model.parameters(), before, strict=True)
     assert any((a != c).any() for a, _, c in pairs)
@@ -300,28 +164,28 @@ def test_the_bare_recipe_is_plain_adam(examples: Examples) -> None:
         torch.testing.assert_close(a, b, rtol=0, atol=1e-8)
 
 
-def test_a_loss_that_is_no_number_names_the_scenes(examples: Examples) -> None:
-    trainer = training.Trainer(CONFIG, examples)
-    trainer.step()
+def test_a_loss_that_is_no_number_names_the_scenes(made: Path) -> None:
+    trainer, ahead = trainer_of(made, CONFIG)
+    trainer.take(ahead)
     with torch.no_grad():
         for weight in trainer.model.body.heads.parameters():
             weight.fill_(torch.inf)
-    with pytest.raises(training.TrainingError, match="step 1: the loss is nan on scenes ") as error:
-        trainer.step()
+    with pytest.raises(TrainingError, match="step 1: the loss is nan on scenes ") as error:
+        trainer.take(ahead)
     assert trainer.done == 1
-    names = draw_batch(examples, CONFIG, 1).names
+    names = draw_batch(made, CONFIG, 1).names
     assert all(name in str(error.value) for name in names)
 
 
 # --- the loss and learning ----------------------------------------------------------------
 
 
-def test_loss_weighs_each_predicate_with_its_eta(examples: Examples) -> None:
+def test_loss_weighs_each_predicate_with_its_eta(made: Path) -> None:
     torch.manual_seed(0)
     model = RelevanceModel(VitConfig.smoke())
     config = replace(CONFIG, mirror=False, eta_same_plane=0.8, eta_on=0.6)
     for step, eta in ((0, 0.8), (1, 0.6)):
-        batch = draw_batch(examples, config, step)
+        batch = draw_batch(made, config, step)
         encoding = model.encode(batch.image, batch.views, batch.present)
         terms = [
             relevance_loss(model.decode(encoding, p, goals), relevant, labelled, eta)
@@ -334,20 +198,20 @@ def test_loss_weighs_each_predicate_with_its_eta(examples: Examples) -> None:
 
 
 def test_each_scene_is_encoded_once_for_all_goals_and_predicates(
-    examples: Examples, monkeypatch: pytest.MonkeyPatch
+    made: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = RelevanceModel(CONFIG.model)
     calls = []
     encode = model.encode
     monkeypatch.setattr(model, "encode", lambda *a: (calls.append(a[0].shape[0]), encode(*a))[1])
-    batch = draw_batch(examples, CONFIG, 0)
+    batch = draw_batch(made, CONFIG, 0)
     batch_loss(model, batch, CONFIG)
     assert calls == [CONFIG.scenes_per_batch]
     assert len(batch.turns) == 4
 
 
 @pytest.mark.parametrize("body", list(SMALL))
-def test_a_network_learns_a_few_scenes_by_heart(examples: Examples, body: str) -> None:
+def test_a_network_learns_a_few_scenes_by_heart(made: Path, body: str) -> None:
     model = SMALL[body]
     config = replace(
         CONFIG,
@@ -361,10 +225,10 @@ def test_a_network_learns_a_few_scenes_by_heart(examples: Examples, body: str) -
         eta_same_plane=0.5,
         eta_on=0.5,
     )
-    trainer = training.Trainer(config, examples)
-    before = measure(trainer.model, examples)
-    losses = [trainer.step() for _ in range(config.steps)]
-    after = measure(trainer.model, examples)
+    trainer, ahead = trainer_of(made, config)
+    before = measure(trainer.model, reader(made, config).whole())
+    losses = [trainer.take(ahead) for _ in range(config.steps)]
+    after = measure(trainer.model, reader(made, config).whole())
     assert np.mean([x["relevance"] for x in losses[-6:]]) < 0.5 * losses[0]["relevance"]
     for family in ("same-plane", "on"):
         found = after[family]["with_goal_objects"]
@@ -372,8 +236,8 @@ def test_a_network_learns_a_few_scenes_by_heart(examples: Examples, body: str) -
         assert found["total"] > found["base_rate"] + 0.1
 
 
-def test_rate_rises_then_falls(examples: Examples) -> None:
-    trainer = training.Trainer(replace(CONFIG, steps=200, warmup=0.05), examples)
+def test_rate_rises_then_falls(made: Path) -> None:
+    trainer, _ = trainer_of(made, replace(CONFIG, steps=200, warmup=0.05))
     rates = [trainer.rate(step) for step in range(200)]
     assert rates[9] == pytest.approx(CONFIG.learning_rate)
     assert max(rates) == pytest.approx(CONFIG.learning_rate)
@@ -435,9 +299,9 @@ def test_accuracy_of_one_class_or_of_nothing_has_no_balance() -> None:
     assert accuracy(np.zeros(0), np.zeros(0, bool))["total"] is None
 
 
-def test_measure_counts_queries_and_goals(examples: Examples, made: Path) -> None:
+def test_measure_counts_queries_and_goals(made: Path) -> None:
     model = RelevanceModel(CONFIG.model)
-    found = measure(model, examples, batch=3)
+    found = measure(model, reader(made, CONFIG).whole(scenes=3))
     rows = Dataset.open(made).read_rows("labels", split="train")
     for predicate in PREDICATES.values():
         own = [row for row in rows if row["predicate"] == predicate.name]
@@ -474,7 +338,7 @@ def test_only_what_decides_the_weights_is_in_the_identity() -> None:
         {"preset": "laptop"},
         {"threads": 2},
         {"save_every": 7},
-        {"cache_bytes": 0},
+        {"workers": 0},
         {"device": "cuda"},
         {"weight_decay": 0.02},
     ):

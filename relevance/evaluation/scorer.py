@@ -20,8 +20,8 @@ import numpy as np
 
 from relevance.errors import RelevanceError, RelevanceWarning
 from relevance.planner import Guide
-from relevance.sampling import Randomisation
-from relevance.scene import Camera, Goal, Predicate, Scene, lookalikes
+from relevance.sampling import same_view, view_of
+from relevance.scene import Goal, Predicate, Scene, lookalikes
 from relevance.store import Dataset
 
 if TYPE_CHECKING:  # models imports torch, which the planner and the report do without
@@ -167,8 +167,8 @@ class NetworkScorer:
         if not same_view(mine, its) and its not in self._warned:
             self._warned.add(its)
             warn(
-                f"scene {scene.id}: its camera ({_pose(its)}) is not the one that the model was "
-                f"trained with ({_pose(mine)}); its scores may mean nothing"
+                f"scene {scene.id}: its camera ({view_of(its)}) is not the one that the model was "
+                f"trained with ({view_of(mine)}); its scores may mean nothing"
             )
         if shown(scene) not in self._seen and shown(scene) not in self._warned:
             for names in lookalikes(scene):
@@ -188,24 +188,6 @@ class NetworkScorer:
 def shown(scene: Scene) -> Hashable:
     """All that a scene's picture depends on; its id and goals are not part of it."""
     return scene.objects, scene.table, scene.camera, scene.light, scene.robot
-
-
-def same_view(a: Camera, b: Camera) -> bool:
-    """Whether two cameras differ by no more than what randomised scenes teach to forgive."""
-    allowed, rounding = Randomisation(), 1e-4
-    shift = max(
-        abs(one - other)
-        for one, other in zip((*a.eye, *a.target), (*b.eye, *b.target), strict=True)
-    )
-    return (
-        shift <= allowed.camera_shift + rounding
-        and abs(a.fov - b.fov) <= allowed.camera_fov + rounding
-    )
-
-
-def _pose(camera: Camera) -> str:
-    eye, target = (", ".join(f"{v:g}" for v in at) for at in (camera.eye, camera.target))
-    return f"eye {eye}; target {target}; fov {camera.fov:g}"
 
 
 def warn(message: str) -> None:

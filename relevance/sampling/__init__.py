@@ -16,6 +16,7 @@ defaults about 14% (same-plane) and 30% (`on`) of the queries are relevant; in t
 """
 
 from relevance.sampling.goals import sample_goals
+from relevance.sampling.looks import same_view, view_of
 from relevance.sampling.scenes import sample_scene
 from relevance.sampling.settings import (
     SAMPLER_VERSION,
@@ -29,6 +30,8 @@ __all__ = [
     "GoalConfig",
     "Randomisation",
     "SceneConfig",
+    "same_view",
     "sample_goals",
     "sample_scene",
+    "view_of",
 ]

@@ -63,3 +63,22 @@ def _rounded(values: np.ndarray | tuple[float, float, float]) -> tuple[float, fl
     """Four digits, so that files stay readable and survive any round trip."""
     x, y, z = (round(float(value), 4) for value in values)
     return x, y, z
+
+
+def same_view(a: Camera, b: Camera, allowed: Randomisation = Randomisation()) -> bool:  # noqa: B008
+    """Whether two cameras differ by no more than what randomised scenes teach to forgive."""
+    rounding = 1e-4
+    shift = max(
+        abs(one - other)
+        for one, other in zip((*a.eye, *a.target), (*b.eye, *b.target), strict=True)
+    )
+    return (
+        shift <= allowed.camera_shift + rounding
+        and abs(a.fov - b.fov) <= allowed.camera_fov + rounding
+    )
+
+
+def view_of(camera: Camera) -> str:
+    """Where a camera looks, in words."""
+    eye, target = (", ".join(f"{v:g}" for v in at) for at in (camera.eye, camera.target))
+    return f"eye {eye}; target {target}; fov {camera.fov:g}"

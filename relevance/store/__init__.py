@@ -22,6 +22,7 @@ from relevance.store.paths import (
     sweep,
 )
 from relevance.store.queries import replanned, sql
+from relevance.store.streaming import polled, shuffled
 from relevance.store.synthetic import synthetic_labels
 from relevance.store.tables import (
     SCHEMAS,
@@ -59,8 +60,10 @@ __all__ = [
     "file_hash",
     "is_remote",
     "locate",
+    "polled",
     "replacing",
     "replanned",
+    "shuffled",
     "sql",
     "sweep",
     "synthetic_labels",

@@ -1,19 +1,18 @@
 """A dataset folder: the rows of its tables, its images, and DuckDB over both.
 
 The scenes file of a shard carries the hash of the shard's tar, a WebDataset that any reader of
-those takes. webdataset itself shuffles here; its import loads torch, which making shards does not
-need.
+those takes.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import duckdb
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -24,10 +23,8 @@ from relevance.store.images import Pictures, Sample, decode, undecoded, write_ta
 from relevance.store.labellings import Labelling
 from relevance.store.parquet import read_parquet, to_parquet
 from relevance.store.paths import DatasetError, file_hash, replacing
+from relevance.store.streaming import shuffled
 from relevance.store.tables import table_schema
-
-BUFFER = 1000
-"""Undecoded samples from which a shuffled one is drawn."""
 
 
 class Dataset(Files):
@@ -143,24 +140,17 @@ class Dataset(Files):
         Shuffling permutes the shards, then draws from a buffer of undecoded samples; it depends
         on the seed alone. Raises DatasetError naming a truncated, changed or missing tar.
         """
-        order = list(self.shards(split) if shards is None else shards)
-        if shuffle_seed is not None:
-            np.random.Generator(np.random.Philox(key=shuffle_seed)).shuffle(order)
-
-        raw: Iterable[dict[str, Any]] = (
-            item
-            for shard in order
-            for item in undecoded(
-                self.read_images(split, shard), str(self.images_path(split, shard))
-            )
-        )
-        if shuffle_seed is not None:
-            # Here and not above: importing webdataset loads torch.
-            from webdataset.filters import detshuffle
-
-            raw = detshuffle(bufsize=BUFFER, initial=BUFFER, seed=shuffle_seed).run(raw)
+        order = self.shards(split) if shards is None else shards
+        if shuffle_seed is None:
+            raw = (item for shard in order for item in self.undecoded(split, shard))
+        else:
+            raw = shuffled(order, partial(self.undecoded, split), shuffle_seed)
         for item in raw:
             yield decode(item)
+
+    def undecoded(self, split: str, shard: int) -> Iterator[dict[str, Any]]:
+        """The samples of a shard, members by name, as `decode` takes them."""
+        return undecoded(self.read_images(split, shard), str(self.images_path(split, shard)))
 
     def connect(
         self,

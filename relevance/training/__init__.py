@@ -2,15 +2,18 @@
 
 What is unusual here:
 
-- The batch of a step is a pure function of (seed, step), so a run that was killed and started
+- What a step learns from is a pure function of (seed, step), so a run that was killed and started
   again ends with the same weights as one that was not; there is no sampler state to save.
+- Scenes come from the shards when they are needed and are decoded by worker processes; no more of
+  a dataset is in memory than what is shuffled.
 - Polling is strict: the predicates take turns p0, p1, ... as in the paper. The same-plane
-  predicates label the same scenes, so their consecutive turns may share one encoding
-  (`share_encodings`); the order of turns is the same either way.
+  predicates label the same scenes: these are decoded once for all their turns, which may share
+  one encoding, too (`share_encodings`); the order of turns is the same either way.
 - Two exact symmetries of the task enlarge a small dataset: a scene in the mirror swaps
   `on-the-left` and `on-the-right`, and exchanging colour channels changes no geometry.
 """
 
+from relevance.training.catalogue import Catalogue
 from relevance.training.checkpoints import (
     CHECKPOINT_VERSION,
     CheckpointError,
@@ -24,38 +27,36 @@ from relevance.training.checkpoints import (
     shipped,
     write_row,
 )
-from relevance.training.examples import (
-    Batch,
-    Examples,
-    draw_batch,
-    draw_batches,
-    load_examples,
-    polling,
-)
+from relevance.training.examples import Answer, Batch, Example, batch_of
 from relevance.training.losses import batch_loss, relevance_loss
+from relevance.training.polling import polling
+from relevance.training.ranks import Ranks
+from relevance.training.reading import Reader, TrainingError
 from relevance.training.settings import TRAINER_VERSION, TrainConfig
 from relevance.training.shipping import ship
 from relevance.training.speed import Speed, measure_speed
-from relevance.training.trainer import Trainer, TrainingError, measure, train, use_bfloat16
+from relevance.training.trainer import Trainer, measure, train, use_bfloat16
 
 __all__ = [
     "CHECKPOINT_VERSION",
     "TRAINER_VERSION",
+    "Answer",
     "Batch",
+    "Catalogue",
     "CheckpointError",
-    "Examples",
+    "Example",
+    "Ranks",
+    "Reader",
     "Speed",
     "TrainConfig",
     "Trainer",
     "TrainingError",
     "age",
     "batch_loss",
+    "batch_of",
     "checkpoint_id",
-    "draw_batch",
-    "draw_batches",
     "find_checkpoint",
     "load_checkpoint",
-    "load_examples",
     "measure",
     "measure_speed",
     "newest_checkpoint",

@@ -13,7 +13,7 @@ from relevance.configs import config, execution, identity_hash
 from relevance.models import BODIES, ModelConfig, model_config
 from relevance.scene import PREDICATES, Predicate
 
-TRAINER_VERSION = "1"
+TRAINER_VERSION = "2"
 """Raised when equal settings on equal data come to mean other weights."""
 
 Count = Annotated[int, Field(ge=1)]
@@ -57,7 +57,8 @@ class TrainConfig:
     goal_objects: bool = True
     """Whether subject and reference are asked about in the loss, too (not in the paper's)."""
     share_encodings: bool = True
-    """Consecutive turns of the same-plane predicates take the same scenes and one step."""
+    """Consecutive turns of one family's predicates take one step; else a step each, on the same
+    scenes."""
     learning_rate: Positive = 8e-4
     weight_decay: Weight = 0.02
     betas: tuple[Share, Share] = (0.9, 0.98)
@@ -95,8 +96,9 @@ class TrainConfig:
     """CPU threads; 0 leaves torch's choice."""
     save_every: Count = execution(50)
     """Steps between saved states."""
-    cache_bytes: Annotated[int, Field(ge=0)] = execution(1_500_000_000)
-    """Decoded images up to this size stay in memory."""
+    workers: Annotated[int, Field(ge=0)] | None = execution(None)
+    """Processes that read and decode ahead, for each that trains; none with 0; one beside a CPU,
+    more beside an accelerator when not given."""
 
     @model_validator(mode="after")
     def _tied(self) -> Self:

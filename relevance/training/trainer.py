@@ -1,30 +1,30 @@
 """One run: model, optimiser and schedule; a killed one goes on where it was saved.
 
-The batch of a step is a pure function of (seed, step), so a run that was killed and started
+What a step learns from is a pure function of (seed, step), so a run that was killed and started
 again ends with the same weights as one that was not; there is no sampler state to save.
-
-Shape suffixes: B scenes, N objects (padded), G goals.
 """
 
 from __future__ import annotations
 
+import math
+import multiprocessing
+import os
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from relevance.errors import RelevanceError
 from relevance.metrics import accuracy
 from relevance.models import RelevanceModel
-from relevance.scene import PREDICATES, group_of
+from relevance.scene import PREDICATES, Predicate, group_of
 from relevance.store import Dataset, DatasetError, locate
+from relevance.training.catalogue import Catalogue
 from relevance.training.checkpoints import (
     CheckpointError,
     checkpoint_id,
@@ -38,34 +38,38 @@ from relevance.training.checkpoints import (
     write_row,
 )
 from relevance.training.decision import offsets, yaws
-from relevance.training.examples import Examples, draw_batches, gather, load_examples
+from relevance.training.examples import Batch
 from relevance.training.losses import batch_loss
+from relevance.training.ranks import ALONE, Ranks, together
+from relevance.training.reading import Reader, TrainingError
 from relevance.training.settings import TrainConfig
 
 Progress = Callable[[int, int], None]
-
-
-class TrainingError(RelevanceError):
-    """A run that cannot go on: says at which step, on which scenes."""
 
 
 class Trainer:
     """Model, optimiser and schedule of one run; `step` does one optimiser step."""
 
     def __init__(
-        self, config: TrainConfig, examples: Examples, start: RelevanceModel | None = None
+        self,
+        config: TrainConfig,
+        predicates: Sequence[Predicate],
+        start: RelevanceModel | None = None,
+        ranks: Ranks = ALONE,
     ) -> None:
-        self.config, self.examples = config, examples
+        self.config, self.ranks = config, ranks
         self.done = 0
         """Steps that were taken."""
         self.seconds = 0.0
-        """Wall time of those steps, over all the processes that took them."""
+        """Wall time of those steps and of waiting for them, over all the runs that took them."""
+        self.waited = 0.0
+        """Seconds of it that were spent waiting for data."""
         self.history: list[dict[str, float]] = []
         """Loss and its parts, averaged between two entries; each with its step."""
         self._sums: dict[str, float] = {}
-        self.device = pick_device(config.device)
+        self.device = ranks.device(pick_device(config.device))
         # Weights are drawn before they move: equal ones on every device.
-        learned = trained_predicates(examples, config)
+        learned = trained_predicates(predicates, config)
         known = start.predicates if start else ()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
@@ -95,32 +99,43 @@ class Trainer:
         share = (step - rise) / max(1.0, self.config.steps - rise)
         return self.config.learning_rate * 0.5 * (1 + float(np.cos(np.pi * min(1.0, share))))
 
-    def step(self) -> dict[str, float]:
-        """One step of the optimiser on the batch of `done`; returns the loss and its parts."""
+    def take(self, steps: Iterator[list[Batch]]) -> dict[str, float]:
+        """One step on what comes next, and how long that took to come."""
         start = time.perf_counter()
+        batches = next(steps)
+        waited = time.perf_counter() - start
+        found = self.step(batches)
+        self.waited += waited
+        self.seconds += time.perf_counter() - start
+        return found
+
+    def step(self, batches: Sequence[Batch]) -> dict[str, float]:
+        """One step of the optimiser on some batches; returns the loss and its parts.
+
+        Raises TrainingError for a loss that is no number, and is then as it was before.
+        """
         self.model.train()
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate(self.done)
-        batches = draw_batches(self.examples, self.config, self.done)
         found = []
         for batch in batches:
             with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
                 found.append(batch_loss(self.model, batch.to(self.device), self.config))
         parts = {name: torch.stack([part[name] for part in found]).mean() for name in found[0]}
-        if not torch.isfinite(parts["loss"]):
-            names = ", ".join(name for batch in batches for name in batch.names)
+        values = dict(zip(parts, self.ranks.means([*parts.values()]), strict=True))
+        if not math.isfinite(values["loss"]):
+            names = ", ".join(self.ranks.all([name for batch in batches for name in batch.names]))
             raise TrainingError(
-                f"step {self.done}: the loss is {float(parts['loss'].detach())} on scenes {names}; "
+                f"step {self.done}: the loss is {values['loss']} on scenes {names}; "
                 "expected a number (a lower learning rate, or other data)"
             )
         self.optimizer.zero_grad(set_to_none=True)
         parts["loss"].backward()
+        self.ranks.share_gradients(self.model.parameters())
         if self.config.clip:
             torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip)
         self.optimizer.step()
         self.done += 1
-        self.seconds += time.perf_counter() - start
-        values = {name: float(value.detach()) for name, value in parts.items()}
         self._record(values)
         return values
 
@@ -139,6 +154,7 @@ class Trainer:
         return {
             "done": self.done,
             "seconds": self.seconds,
+            "waited": self.waited,
             "history": self.history,
             "sums": self._sums,
             "model": self.model.state_dict(),
@@ -149,15 +165,15 @@ class Trainer:
         """Go on from a saved `state`."""
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.done, self.seconds = state["done"], state["seconds"]
+        self.done, self.seconds, self.waited = (state[k] for k in ("done", "seconds", "waited"))
         self.history, self._sums = list(state["history"]), dict(state["sums"])
 
 
-def trained_predicates(examples: Examples, config: TrainConfig) -> list[str]:
+def trained_predicates(predicates: Sequence[Predicate], config: TrainConfig) -> list[str]:
     """Names of the predicates that are learned: those with labels, and their mirror images."""
-    seen = {predicate.name for predicate in examples.goals}
+    seen = {predicate.name for predicate in predicates}
     if config.mirror:
-        seen |= {predicate.mirror for predicate in examples.goals}
+        seen |= {predicate.mirror for predicate in predicates}
     return [name for name in PREDICATES if name in seen]
 
 
@@ -182,69 +198,104 @@ def train(
 
     ID is a hash of the config and of the data, see `checkpoint_id`. A finished run is not
     repeated; one that was killed goes on from its last saved state. `out` is another folder for
-    the files. Raises DatasetError when there is nothing to learn from.
+    the files. Under `torchrun` its processes train together, and the first one writes. Raises
+    DatasetError when there is nothing to learn from.
     """
     dataset = Dataset.open(root)
-    name = checkpoint_id(dataset, config)
+    name, data = checkpoint_id(dataset, config), data_hash(dataset, config)
     folder = locate(out) if out is not None else dataset.path / "checkpoints"
-    path, unfinished = folder / f"{name}.pt", folder / f"{name}.state"
+    path = folder / f"{name}.pt"
     if path.exists():
         _, meta = load_checkpoint(path)
         if meta["checkpoint_id"] != name:
             raise CheckpointError(f"{path}: holds {meta['checkpoint_id']}, expected {name}")
         write_row(dataset, path, meta)
         return path
-    examples = _load(dataset, "train", config, folder)
-    if not examples.goals:
-        raise DatasetError(
-            f"{dataset.path}: no labels with split train and policy {config.policy}, "
-            "expected at least one labelled goal"
-        )
-    if config.predicates and (lacking := set(config.predicates) - {p.name for p in examples.goals}):
-        raise DatasetError(
-            f"{dataset.path}: no labels of {min(lacking)} with split train and policy "
-            f"{config.policy}, which the settings ask for"
-        )
-    start, before = _start(dataset, config, examples)
-    with _threads(config.threads):
-        trainer = Trainer(replace(config, model=start.config) if start else config, examples, start)
-        if unfinished.exists():
-            trainer.resume(read_file(unfinished, "state", trainer.device))
-        while trainer.done < config.steps:
-            try:
-                trainer.step()
-            except TrainingError:
-                write_file(unfinished, "state", trainer.state())  # as it was before the step
-                raise
-            if progress:
-                progress(trainer.done, config.steps)
-            if trainer.done % config.save_every == 0 and trainer.done < config.steps:
-                write_file(unfinished, "state", trainer.state())
-        del examples
-        trainer.examples = _load(dataset, "validation", config, folder)
-        metrics = measure(trainer.model, trainer.examples)
-    meta = {
-        "checkpoint_id": name,
-        "config": trainer.config.to_dict(),
-        "config_hash": config.content_hash,
-        "dataset_hash": data_hash(dataset, config),
-        "created": datetime.now(UTC).isoformat(),
-        "train_seconds": trainer.seconds,
-        "bfloat16": trainer.bfloat16,
-        "parameters": sum(p.numel() for p in trainer.model.parameters()),
-        "metrics": metrics,
-        "offsets": offsets(metrics, before),
-        "yaws": yaws(dataset),
-        "history": trainer.history,
-    }
-    save_checkpoint(path, trainer.model, meta)
-    write_row(dataset, path, meta)
-    unfinished.unlink(missing_ok=True)
+    catalogue = Catalogue.of(dataset, "train", config)
+    _check(dataset, catalogue, config)
+    start, before = _start(dataset, config, catalogue)
+    own = replace(config, model=start.config) if start else config
+    run = _Run(path=folder / f"{own.model.body}-{config.content_hash}.state", data=data)
+    with _threads(config.threads), together() as ranks:
+        trainer = Trainer(own, catalogue.predicates, start, ranks)
+        run.resume(trainer)
+        with closing(_reader(catalogue, trainer).steps(trainer.done)) as steps:
+            while trainer.done < config.steps:
+                try:
+                    trainer.take(steps)
+                except TrainingError:
+                    run.save(trainer)  # as it was before the step
+                    raise
+                if progress and ranks.first:
+                    progress(trainer.done, config.steps)
+                if trainer.done % config.save_every == 0 and trainer.done < config.steps:
+                    run.save(trainer)
+        if ranks.first:
+            validation = Catalogue.of(dataset, "validation", config)
+            metrics = measure(trainer.model, _reader(validation, trainer).whole())
+            meta = {
+                "checkpoint_id": name,
+                "config": own.to_dict(),
+                "config_hash": config.content_hash,
+                "dataset_hash": data,
+                "created": datetime.now(UTC).isoformat(),
+                "train_seconds": trainer.seconds,
+                "wait_seconds": trainer.waited,
+                "bfloat16": trainer.bfloat16,
+                "parameters": sum(p.numel() for p in trainer.model.parameters()),
+                "metrics": metrics,
+                "offsets": offsets(metrics, before),
+                "yaws": yaws(dataset),
+                "history": trainer.history,
+            }
+            save_checkpoint(path, trainer.model, meta)
+            write_row(dataset, path, meta)
+            run.path.unlink(missing_ok=True)
+        ranks.wait()
     return path
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Run:
+    """Where an unfinished run is kept, and the data that it began on."""
+
+    path: Path
+    data: str
+
+    def save(self, trainer: Trainer) -> None:
+        if trainer.ranks.first:
+            write_file(self.path, "state", {"data": self.data, **trainer.state()})
+
+    def resume(self, trainer: Trainer) -> None:
+        """Go on from the saved state, if there is one; TrainingError when the data is another."""
+        if not self.path.exists():
+            return
+        state = read_file(self.path, "state", trainer.device)
+        if state["data"] != self.data:
+            raise TrainingError(
+                f"{self.path}: was saved at step {state['done']} while training on data "
+                f"{state['data']}, found {self.data}: the dataset grew or was labelled anew "
+                "meanwhile; delete that file to train on what is there now"
+            )
+        trainer.resume(state)
+
+
+def _check(dataset: Dataset, catalogue: Catalogue, config: TrainConfig) -> None:
+    """Raise DatasetError unless there is something to learn for all that is asked for."""
+    names = {predicate.name for predicate in catalogue.predicates}
+    where = f"with split train and policy {config.policy}"
+    if lacking := set(config.predicates) - names:
+        raise DatasetError(
+            f"{dataset.path}: no labels of {min(lacking)} {where}, which the settings ask for"
+        )
+    if not names:
+        raise DatasetError(
+            f"{dataset.path}: no labels {where}, expected at least one labelled goal"
+        )
+
+
 def _start(
-    dataset: Dataset, config: TrainConfig, examples: Examples
+    dataset: Dataset, config: TrainConfig, catalogue: Catalogue
 ) -> tuple[RelevanceModel | None, dict[str, float]]:
     """The model whose weights stay, and its offsets, which stay too.
 
@@ -255,7 +306,7 @@ def _start(
     model, meta = load_checkpoint(find_checkpoint(dataset.path, config.start))
     if meta["checkpoint_id"] != config.start:
         raise CheckpointError(f"start: {config.start} is no id, it holds {meta['checkpoint_id']}")
-    there = set(trained_predicates(examples, config)) & set(model.predicates)
+    there = set(trained_predicates(catalogue.predicates, config)) & set(model.predicates)
     if there:
         raise CheckpointError(
             f"start: {config.start} has a head for {min(there)}, expected new --predicates"
@@ -263,18 +314,20 @@ def _start(
     return model, meta.get("offsets", {})
 
 
-def _load(dataset: Dataset, split: str, config: TrainConfig, folder: Path) -> Examples:
-    return load_examples(
-        dataset,
-        split,
-        camera=config.model.camera,
-        policy=config.policy,
-        ambiguous=config.ambiguous,
-        predicates=config.predicates,
-        families=config.families,
-        cache_bytes=config.cache_bytes,
-        folder=folder,
-        soft=config.soft_labels and split == "train",
+def _reader(catalogue: Catalogue, trainer: Trainer) -> Reader:
+    """What reads for a trainer; a network that is told where objects are needs no pictures."""
+    ahead = trainer.config.workers
+    if ahead is None:
+        ahead = 1 if trainer.device.type == "cpu" else min(8, max(1, (os.cpu_count() or 2) - 1))
+    if multiprocessing.current_process().daemon:
+        ahead = 0  # Dask's workers may not have processes of their own
+    return Reader(
+        catalogue=catalogue,
+        config=trainer.config,
+        pictures=not trainer.model.told,
+        workers=ahead,
+        rank=trainer.ranks.rank,
+        ranks=trainer.ranks.count,
     )
 
 
@@ -291,8 +344,8 @@ def _threads(count: int) -> Iterator[None]:
 # --- metrics ------------------------------------------------------------------------------
 
 
-def measure(model: RelevanceModel, examples: Examples, batch: int = 16) -> dict[str, Any]:
-    """Metrics per predicate on all goals of the examples, of the network's own scores (no offset
+def measure(model: RelevanceModel, batches: Iterable[Batch]) -> dict[str, Any]:
+    """Metrics per predicate on all goals of the batches, of the network's own scores (no offset
     added); see `accuracy`.
 
     `queries` leaves subject and reference out, `with_goal_objects` has them. `same-plane` pools
@@ -302,22 +355,21 @@ def measure(model: RelevanceModel, examples: Examples, batch: int = 16) -> dict[
     model.eval()
     pooled: dict[str, list[tuple[np.ndarray, ...]]] = {}
     with torch.inference_mode():
-        for predicate, family in product(examples.goals, sorted(set(examples.families), key=str)):
-            if predicate.name not in model.predicates:
-                continue
-            scenes = examples.scenes([predicate], family)
-            for start in range(0, len(scenes), batch):
-                drawn = gather(examples, scenes[start : start + batch], [predicate])
-                drawn = drawn.to(model.device)
-                encoding = model.encode(drawn.image, drawn.views, drawn.present, drawn.geometry)
-                ((_, goals, relevant, labelled),) = drawn.turns
-                score = model.decode(encoding, predicate, goals)
+        for batch in batches:
+            drawn = batch.to(model.device)
+            encoding = model.encode(drawn.image, drawn.views, drawn.present, drawn.geometry)
+            for predicate, goals, relevant, labelled in drawn.turns:
+                if predicate.name not in model.predicates:
+                    continue
+                score = model.decode(encoding, predicate, goals, labelled)
                 places = torch.arange(score.shape[-1], device=score.device)
                 asked = places[:, None] != goals[..., None, :]
-                arrays = (score, relevant, labelled, asked.all(-1))
-                rows = tuple(array.flatten(0, 1).cpu().numpy() for array in arrays)
-                for name in {group_of(predicate.name, family), family or predicate.family}:
-                    pooled.setdefault(name, []).append(rows)
+                arrays = (score, relevant.bool(), labelled, asked.all(-1))
+                for family in set(drawn.families):
+                    own = [i for i, its in enumerate(drawn.families) if its == family]
+                    rows = tuple(array[own].flatten(0, 1).cpu().numpy() for array in arrays)
+                    for name in {group_of(predicate.name, family), family}:
+                        pooled.setdefault(name, []).append(rows)
     return {name: _metrics(parts) for name, parts in sorted(pooled.items())}
 
 

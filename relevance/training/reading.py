@@ -1,0 +1,212 @@
+"""The reader that trains: labelled scenes in an order of seed and step, from the shards themselves.
+
+A look is what is decoded at once: some scenes, for predicates that take turns on them. Each group
+of predicates goes through the shards that it has labels in, in an order of each epoch of its own,
+and all its examples come before any comes again. Which look a step takes is arithmetic, so a run
+that goes on begins where it was: what was consumed is passed over undecoded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain, count, islice
+
+import numpy as np
+import torch
+
+from relevance.errors import RelevanceError
+from relevance.scene import PREDICATES, Predicate
+from relevance.store import polled, shuffled
+from relevance.training.catalogue import Catalogue, Shard
+from relevance.training.examples import (
+    Answer,
+    Batch,
+    Example,
+    batch_of,
+    goals_of,
+    in_the_mirror,
+    recolored,
+)
+from relevance.training.polling import looks_of, polling
+from relevance.training.settings import TrainConfig
+
+
+class TrainingError(RelevanceError):
+    """A run that cannot go on: says at which step, on which scenes."""
+
+
+SCENES, QUERIES = 1000, 20_000
+"""Scenes, or single queries, from which a shuffled one is drawn."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """What is decoded at once, before it is."""
+
+    predicates: tuple[Predicate, ...]
+    number: int
+    """How many looks these predicates took before."""
+    examples: tuple[Example, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reader:
+    """Batches of what a catalogue lists, the same for any number of workers.
+
+    Of several processes that train together, each reads its share of every batch.
+    """
+
+    catalogue: Catalogue
+    config: TrainConfig
+    pictures: bool = True
+    """Whether images are decoded; else they are blank."""
+    workers: int = 0
+    """Processes that read and decode; 0: it is done where the batches are asked for."""
+    rank: int = 0
+    ranks: int = 1
+
+    def __post_init__(self) -> None:
+        size, what = self.config.scenes_per_batch, "scenes"
+        if self.config.queries_per_batch:
+            size, what = self.config.queries_per_batch, "queries"
+        if size < self.ranks:
+            raise TrainingError(
+                f"{size} {what} a batch for {self.ranks} processes, expected at least one each"
+            )
+
+    def steps(self, first: int = 0) -> Generator[list[Batch]]:
+        """What each step learns from, from step `first` to the last of the run."""
+        groups, last = self.catalogue.groups, self.config.steps - 1
+        begin = looks_of(first, groups, self.config)[0][0]
+        end = looks_of(last, groups, self.config)[-1][0] + 1
+        looks = polled(self._streams(begin), self._learned, count=end - begin, workers=self.workers)
+        ahead = enumerate(looks, begin)
+        at, batch = next(ahead)
+        for step in range(first, self.config.steps):
+            found = []
+            for look, turns in looks_of(step, groups, self.config):
+                while at < look:
+                    at, batch = next(ahead)
+                found.append(replace(batch, turns=batch.turns[turns]))
+            yield found
+
+    def whole(self, scenes: int = 16) -> Iterator[Batch]:
+        """Every labelled scene once, in stored order, with all its goals."""
+        stream = chain.from_iterable(
+            _cut(
+                group,
+                chain.from_iterable(
+                    self.catalogue.read(shard, group) for shard in self.catalogue.shards
+                ),
+                scenes,
+            )
+            for group in polling(self.catalogue.predicates, share=True)
+        )
+        return polled([stream], self._asked, count=None, workers=self.workers)
+
+    # looks ------------------------------------------------------------------------------------
+
+    def _streams(self, begin: int) -> list[Iterator[Look]]:
+        """The looks of each group from the one that look `begin` of the run is, that one first."""
+        total = len(self.catalogue.groups)
+        if self.config.polling == "one-by-one":
+            each = -(-self.config.steps // total)
+            now, done = divmod(begin, each)
+            rest = (islice(self._looks(group, 0), each) for group in range(now + 1, total))
+            return [chain(islice(self._looks(now, done), each - done), chain.from_iterable(rest))]
+        round_, now = divmod(begin, total)
+        order = [*range(now, total), *range(now)]
+        return [self._looks(group, round_ + (group < now)) for group in order]
+
+    def _looks(self, group: int, first: int) -> Iterator[Look]:
+        """The looks of a group from its number `first`, epoch after epoch."""
+        size = self.config.queries_per_batch or self.config.scenes_per_batch
+        epoch, passed = divmod(first * size, sum(self.catalogue.counts[group].values()))
+        examples = chain.from_iterable(self._epoch(group, number) for number in count(epoch))
+        return _cut(self.catalogue.groups[group], islice(examples, passed, None), size, first)
+
+    def _epoch(self, group: int, number: int) -> Iterator[Example]:
+        """All examples of a group, shuffled: scenes with their goals, or with one query each."""
+        predicates = self.catalogue.groups[group]
+        seed = int(_rng(self.config.seed, 1, predicates, number).integers(2**62))
+        counts = self.catalogue.counts[group]
+        shards = [shard for shard in self.catalogue.shards if shard.number in counts]
+        if self.config.queries_per_batch:
+            return shuffled(shards, partial(self._queries, predicates), seed, buffer=QUERIES)
+        return shuffled(shards, partial(self._scenes, predicates), seed, buffer=SCENES)
+
+    def _scenes(self, predicates: tuple[Predicate, ...], shard: Shard) -> Iterator[Example]:
+        return self.catalogue.read(shard, predicates)
+
+    def _queries(self, predicates: tuple[Predicate, ...], shard: Shard) -> Iterator[Example]:
+        for example in self.catalogue.read(shard, predicates):
+            for predicate, answers in example.answers.items():
+                for answer in answers:
+                    if self.config.goal_objects or not answer.about_goal:
+                        yield replace(example, answers={predicate: (answer,)})
+
+    # batches ----------------------------------------------------------------------------------
+
+    def _learned(self, look: Look) -> Batch:
+        """This process's share of a look, with its goals drawn, as it is shown to the network."""
+        config, size = self.config, len(look.examples)
+        examples = look.examples[self.rank :: self.ranks]
+        if config.queries_per_batch:
+            examples = _together(examples)
+        else:
+            first = look.number * size + self.rank
+            examples = [
+                self._some_goals(example, _rng(config.seed, 3, look.predicates, place))
+                for place, example in zip(count(first, self.ranks), examples, strict=False)
+            ]
+        batch = batch_of(examples, look.predicates, config.model.camera, pictures=self.pictures)
+        rng = _rng(config.seed, 2, look.predicates, look.number)
+        if config.recolor:
+            batch = recolored(batch, torch.from_numpy(rng.permutation(3)))
+        return in_the_mirror(batch) if config.mirror and rng.integers(2) else batch
+
+    def _asked(self, look: Look) -> Batch:
+        camera = self.config.model.camera
+        return batch_of(look.examples, look.predicates, camera, pictures=self.pictures)
+
+    def _some_goals(self, example: Example, rng: np.random.Generator) -> Example:
+        """The example with at most `goals_per_scene` goals of each predicate."""
+        most, kept = self.config.goals_per_scene, dict(example.answers)
+        for predicate, answers in example.answers.items():
+            goals = goals_of(answers)
+            if len(goals) > most:
+                drawn = np.sort(rng.permutation(len(goals))[:most])
+                kept[predicate] = [answer for goal in drawn for answer in goals[goal]]
+        return replace(example, answers=kept)
+
+
+def _cut(
+    predicates: tuple[Predicate, ...], examples: Iterator[Example], size: int, first: int = 0
+) -> Iterator[Look]:
+    for number in count(first):
+        if not (some := tuple(islice(examples, size))):
+            return
+        yield Look(predicates=predicates, number=number, examples=some)
+
+
+def _together(examples: tuple[Example, ...]) -> list[Example]:
+    """One example a scene, with all the answers that were drawn of it."""
+    found: dict[str, Example] = {}
+    answers: dict[str, dict[Predicate, list[Answer]]] = {}
+    for example in examples:
+        found.setdefault(example.name, example)
+        for predicate, drawn in example.answers.items():
+            own = answers.setdefault(example.name, {})
+            own.setdefault(predicate, []).extend(drawn)
+    return [replace(example, answers=answers[name]) for name, example in found.items()]
+
+
+def _rng(
+    seed: int, purpose: int, predicates: tuple[Predicate, ...], index: int
+) -> np.random.Generator:
+    """Random numbers of the looks of a group, counted by its first predicate."""
+    stream = list(PREDICATES.values()).index(predicates[0])
+    counter = [0, index, stream, purpose]
+    return np.random.Generator(np.random.Philox(key=seed, counter=counter))
