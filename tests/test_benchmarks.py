@@ -411,3 +411,18 @@ def test_a_file_where_the_folder_belongs_is_one_line(tmp_path, capsys):
     (tmp_path / "taken").touch()
     assert main(["bench", "planner", "--out", str(tmp_path / "taken")]) == 2
     assert "taken: File exists, expected a folder" in capsys.readouterr().err
+
+
+def test_training_is_measured_for_every_reading(tmp_path, capsys):
+    flags = ["--bodies", "vit", "geometry", "--scenes", "1", "--goals", "1", "--objects", "3"]
+    flags += ["--queries", "1", "--seconds", "0", "--device", "cpu", "--out", str(tmp_path)]
+    assert main(["bench", "training", *flags]) == 0
+    printed = capsys.readouterr().out
+    assert "geometry is told the true poses" in printed
+    with (tmp_path / "training.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    names = [row["body"] for row in rows]
+    assert names == ["vit shared", "vit trio", "vit no-patches", "geometry"]
+    assert all(float(row["queries"]) > 0 for row in rows)
+    assert main(["bench", "training", "--bodies", "cnn"]) == 2
+    assert "--bodies cnn: expected one of geometry, glimpse" in capsys.readouterr().err
