@@ -179,7 +179,9 @@ def _flip(rows: list[dict]) -> None:
 
 
 def _move(rows: list[dict]) -> None:
-    first_held(rows)["final"][-1]["position"][0] += 0.2
+    row = first_held(rows)
+    subject = next(pose for pose in row["final"] if pose["name"] == row["subject"])
+    subject["position"][0] += 0.5
 
 
 CHANGES: dict[str, tuple[str, str, str, Callable[[list[dict]], object]]] = {
@@ -474,6 +476,7 @@ def test_failures_are_counted_by_reason(dataset: Dataset) -> None:
     columns, rows = sql(dataset.path, "FROM plan_failures WHERE reason = 'node limit'")
     assert [dict(zip(columns, row, strict=True)) for row in rows] == [
         {
+            "family": "same-plane",
             "predicate": "behind",
             "split": "train",
             "status": "limit",

@@ -370,17 +370,17 @@ def test_planning_anew_leaves_the_images(made: Path) -> None:
     more = replace(CONFIG, goals_per_scene=2)
     with pytest.raises(DatasetError, match="plan it anew"):
         prepare(made, more)
-    spec = prepare(made, more, replan=True)[-1]
+    spec = prepare(made, more, replan=True)[0]
     dataset = Dataset.open(made)
     with untouched(*dataset.files("scenes"), *made.rglob("*.tar")):
         assert generate_shard(made, more, spec).skipped
-        report = label_shard(made, more, spec, "on")
+        report = label_shard(made, more, spec, "behind")
     assert not report.skipped
     assert report.rows > spec.count
-    name = f"predicate=on/split=test/shard-{spec.shard:06d}.parquet"
+    name = f"predicate=behind/split=train/shard-{spec.shard:06d}.parquet"
     assert (made / "plans" / name).read_bytes() == before[f"plans/{name}"], "until all are made"
     beside = dataset.shard_path(
-        "plans", split="test", shard=spec.shard, predicate="on", of=more.labelling
+        "plans", split="train", shard=spec.shard, predicate="behind", of=more.labelling
     )
     assert beside.read_bytes() != before[f"plans/{name}"]
 
@@ -440,7 +440,7 @@ def test_labels_need_scenes_and_a_fitting_predicate(tmp_path: Path) -> None:
     spec = prepare(tmp_path, CONFIG)[0]
     with pytest.raises(DatasetError, match=r"shard-000000.parquet: does not exist, expected its"):
         label_shard(tmp_path, CONFIG, spec, "behind")
-    with pytest.raises(ValueError, match="on: expected a predicate of family same-plane"):
+    with pytest.raises(ValueError, match="on: expected one that is asked there, on-the-left, "):
         label_shard(tmp_path, CONFIG, spec, "on")
     with pytest.raises(DatasetError, match=r"no dataset\.json there"):
         label_shard(tmp_path / "nowhere", CONFIG, spec, "behind")

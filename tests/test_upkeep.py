@@ -516,7 +516,8 @@ def test_plain_duckdb_sees_what_changed(made: Path) -> None:
             name = statement.query.split("VIEW ")[1].split()[0]
             if name not in ("checkpoints", "predictions", "evaluations"):
                 plain.execute(statement)
-        plain.execute((SCHEMAS / "changes.sql").read_text())
+        for file in ("views.sql", "changes.sql"):
+            plain.execute((SCHEMAS / file).read_text())
         count = "select count(*) from label_changes"
         assert plain.execute(count).fetchall() == sql(made, count)[1]
         assert sql(made, count)[1][0][0] > 0
