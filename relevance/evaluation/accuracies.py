@@ -1,6 +1,8 @@
 """How right a checkpoint is: its predictions as columns, judged beside two rules, in tables.
 
 Judged by the labels of the policy that the checkpoint learned, as they are when they are read.
+
+Shape suffixes: R rows of predictions.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Our own body: find each object by its view, look at it closely, then reason about the goal.
 
 Shape suffixes: B scenes, N objects (padded), G goals, P cells of the stride-4 feature map,
-D width, E channels, H and W height and width in pixels, h and w the same at stride 4.
+D width, E channels, K looks, H and W height and width in pixels, h and w the same at stride 4.
 """
 
 from __future__ import annotations

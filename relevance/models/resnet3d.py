@@ -3,7 +3,7 @@
 Everything meets from the first layer on, so nothing is shared between queries.
 
 Shape suffixes: B scenes, N objects (padded), G goals, T trios of subject, reference and query,
-P image patches, X = 3 x 32 x 32 numbers of a picture, D width.
+P image patches, X = 3 x 32 x 32 numbers of a picture, D width, E = 3 x D.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The paper's vision transformer, in the three ways in which its attention can be read.
 
 Shape suffixes: B scenes, N objects (padded), G goals, T trios of subject, reference and query,
-P image patches, D width.
+P image patches, L = P + N tokens, D width.
 """
 
 from __future__ import annotations
