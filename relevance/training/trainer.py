@@ -10,6 +10,7 @@ import math
 import multiprocessing
 import os
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from relevance.errors import RelevanceWarning
 from relevance.metrics import accuracy
 from relevance.models import RelevanceModel
 from relevance.scene import PREDICATES, Predicate, group_of
@@ -215,7 +217,7 @@ def train(
     _check(dataset, catalogue, config)
     start, before = _start(dataset, config, catalogue)
     own = replace(config, model=start.config) if start else config
-    run = _Run(path=folder / f"{own.model.body}-{config.content_hash}.state", data=data)
+    run = _Run(folder=folder, settings=f"{own.model.body}-{config.content_hash}", data=data)
     with _threads(config.threads), together() as ranks:
         trainer = Trainer(own, catalogue.predicates, start, ranks)
         run.resume(trainer)
@@ -257,27 +259,33 @@ def train(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Run:
-    """Where an unfinished run is kept, and the data that it began on."""
+    """Where an unfinished run of some settings on some data is kept."""
 
-    path: Path
+    folder: Path
+    settings: str
     data: str
+
+    @property
+    def path(self) -> Path:
+        return self.folder / f"{self.settings}-{self.data}.state"
 
     def save(self, trainer: Trainer) -> None:
         if trainer.ranks.first:
-            write_file(self.path, "state", {"data": self.data, **trainer.state()})
+            write_file(self.path, "state", trainer.state())
 
     def resume(self, trainer: Trainer) -> None:
-        """Go on from the saved state, if there is one; TrainingError when the data is another."""
-        if not self.path.exists():
-            return
-        state = read_file(self.path, "state", trainer.device)
-        if state["data"] != self.data:
-            raise TrainingError(
-                f"{self.path}: was saved at step {state['done']} while training on data "
-                f"{state['data']}, found {self.data}: the dataset grew or was labelled anew "
-                "meanwhile; delete that file to train on what is there now"
-            )
-        trainer.resume(state)
+        """Go on from the saved state, if there is one; what others learned stays where it is."""
+        if self.path.exists():
+            trainer.resume(read_file(self.path, "state", trainer.device))
+        elif trainer.ranks.first and self.folder.is_dir():
+            for other in sorted(self.folder.glob(f"{self.settings}-*.state")):
+                warnings.warn(
+                    f"{other}: an unfinished run of these settings, on data that has grown or was "
+                    "labelled anew since; this run begins at step 0 (delete that file if nobody "
+                    "needs it)",
+                    RelevanceWarning,
+                    stacklevel=2,
+                )
 
 
 def _check(dataset: Dataset, catalogue: Catalogue, config: TrainConfig) -> None:
