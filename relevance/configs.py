@@ -66,6 +66,8 @@ def first_error(error: ValidationError) -> str:
     where = "".join(f".{part}" for part in first["loc"])
     if first["type"] == "unexpected_keyword_argument":
         return f"{where}: unknown field"
+    if first["type"].startswith("missing"):
+        return f"{where}: expected there, found no such field"
     message = first["msg"].removeprefix("Value error, ")
     message = message.removeprefix("Input should be ").removeprefix("a ")
     if not where:

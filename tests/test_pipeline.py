@@ -208,7 +208,7 @@ def test_other_settings_are_refused(tmp_path: Path, change: dict, message: str) 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"config": {"seed": "x"}}, r"dataset.json: config.seed: "),
+        ({"config": {"seed": "x"}}, r"dataset.json: config.seed = "),
         ({"shards": [{"split": "train"}]}, r"dataset.json: shards.0.shard: "),
     ],
 )

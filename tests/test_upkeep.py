@@ -459,6 +459,9 @@ def test_export_loads_with_datasets(made: Path, tmp_path: Path) -> None:
     export(stored, out)
     assert {file: file.read_bytes() for file in again} == again
     (out / "notes.txt").write_text("mine")
+    with pytest.raises(DatasetError, match="expected a folder outside the dataset"):
+        export(Dataset.open(made), made / "out")
+    assert not (made / "out").exists()
     with pytest.raises(DatasetError, match="expected an empty folder or an earlier export"):
         export(stored, out)
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter, ValidationError, field_validator
 
-from relevance.configs import ConfigError, config, identity_hash
+from relevance.configs import ConfigError, config, first_error, identity_hash
 from relevance.labels import LABELS_VERSION, POLICIES
 from relevance.planner import PLANNER_VERSION, PlannerConfig
 from relevance.sampling import SAMPLER_VERSION, GoalConfig, SceneConfig
@@ -343,9 +343,7 @@ def _from_description(
     except ConfigError as error:
         raise DatasetError(f"{file}: {key}: {error}") from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field_name = ".".join(str(part) for part in (key, *first["loc"]))
-        raise DatasetError(f"{file}: {field_name}: {first['msg']}") from None
+        raise DatasetError(f"{file}: {key}{first_error(error)}") from None
 
 
 _CONFIG = TypeAdapter(DatasetConfig)

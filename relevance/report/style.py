@@ -75,10 +75,11 @@ def pooled(group: str) -> bool:
 
 
 def named(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows with family and predicate, each with the `group` that it is shown as, in order."""
+    """Rows with family and predicate, each with the `group` that it is shown as, in order; what
+    is not registered here comes last."""
     found = [row | {"group": _named(row["predicate"], row["family"])} for row in rows]
-    order = groups()
-    return sorted(found, key=lambda row: order.index(row["group"]))
+    order = {group: place for place, group in enumerate(groups())}
+    return sorted(found, key=lambda row: (order.get(row["group"], len(order)), row["group"]))
 
 
 def _named(predicate: str, family: str | None) -> str:

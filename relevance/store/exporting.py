@@ -49,6 +49,8 @@ def export(dataset: Dataset, out: str | Path, progress: Progress | None = None) 
     out = locate(out)
     if is_remote(out):
         raise DatasetError(f"{out}: expected a local folder to export to")
+    if out.resolve().is_relative_to(dataset.path.resolve()):
+        raise DatasetError(f"{out}: expected a folder outside the dataset {dataset.path}")
     with writing(out, out):
         if out.exists() and any(i.name not in {"README.md", _HALF, *_ROWS} for i in out.iterdir()):
             raise DatasetError(f"{out}: expected an empty folder or an earlier export")
