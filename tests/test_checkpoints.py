@@ -383,7 +383,7 @@ def test_a_head_that_is_trained_alone_leaves_the_others_as_they_are(root: Path) 
 def test_the_newest_checkpoint_and_how_one_is_named(root: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no checkpoints there, expected `train` first"):
         newest_checkpoint(root)
-    with pytest.raises(DatasetError, match="expected a file or one of none: nothing was trained"):
+    with pytest.raises(DatasetError, match="expected a file or one of geometry, glimpse"):
         find_checkpoint(root, "glimpse-1")
     first, second = (train(root, replace(CONFIG, steps=1, seed=seed)) for seed in (0, 1))
     assert newest_checkpoint(root) == find_checkpoint(root) == second

@@ -69,7 +69,7 @@ def refused(dataset: Dataset) -> str | None:
     """
     files = [file for table in TABLES for file in dataset.files(table)] + dataset.files_beside()
     unreadable = {file for file in files if _cut(dataset, file)}
-    with dataset.connect(without=unreadable) as connection:
+    with dataset.connect(without=unreadable, names=["plans"]) as connection:
         query = "select count(replay_ok), count(*) filter (not replay_ok) from plans"
         [(replayed, bad)] = connection.execute(query).fetchall()
     if bad <= max(REFUSED_LEAST, REFUSED_SHARE * replayed):

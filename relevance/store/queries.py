@@ -54,7 +54,11 @@ def connect(
     if is_remote(dataset.path):
         connection.register_filesystem(filesystem(dataset.path))
     for name, body in bodies.items():
-        connection.execute(f"CREATE {'TABLE' if memory else 'VIEW'} {name} AS {body}")
+        try:
+            connection.execute(f"CREATE {'TABLE' if memory else 'VIEW'} {name} AS {body}")
+        except duckdb.Error as error:  # such as a gathered file whose footer was changed
+            mend = f"`relevance repair {dataset.path}` mends it"
+            raise DatasetError(f"{dataset.path}: {name}: {one_line(error)}; {mend}") from None
     for name, statement in views().items():
         if name in names:
             connection.execute(statement)
