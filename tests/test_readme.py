@@ -32,6 +32,7 @@ NOT_RUN = {
     r"\brai\b": "needs rai, which is an extra: tests/test_rai.py",
     r"^(duckdb|D) ": "the duckdb program is not installed with the project",
     r"^relevance bench\b": "measures for minutes: tests/test_benchmarks.py",
+    r"^relevance diff\b": "needs a dataset that was planned anew: tests/test_families.py",
     r"laptop|paper": "makes much",
 }
 """Lines of shell that are left out, and why."""
