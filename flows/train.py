@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from flows.head import leave_page, leave_table, retried, say, stage
 from flows.parameters import DatasetPath, Overrides, Preset, absolute, configured
 from flows.shards import progress
+from relevance.configs import dotted
 
 if TYPE_CHECKING:
     from relevance.training import TrainConfig
@@ -66,13 +67,8 @@ def train(
 def table(metrics: dict[str, Any]) -> list[dict[str, Any]]:
     """One row a group of the metrics, inner names dotted, shares rounded."""
 
-    def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-        row: dict[str, Any] = {}
-        for name, value in values.items():
-            if isinstance(value, dict):
-                row |= flat(value, f"{prefix}{name}.")
-            else:
-                row[prefix + name] = round(value, 4) if isinstance(value, float) else value
-        return row
-
-    return [{"group": group} | flat(values) for group, values in metrics.items()]
+    return [
+        {"group": group}
+        | {k: round(v, 4) if isinstance(v, float) else v for k, v in dotted(values).items()}
+        for group, values in metrics.items()
+    ]

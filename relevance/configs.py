@@ -137,6 +137,15 @@ def override(config: Any, changes: Mapping[str, Any], where: str = "") -> Any:
     return dataclasses.replace(config, **made)
 
 
+def dotted(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Nested values as one mapping with dotted names, as `override` takes them."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        inner = isinstance(value, Mapping)
+        flat |= dotted(value, f"{before}{name}.") if inner else {f"{before}{name}": value}
+    return flat
+
+
 def _checked(hint: Any, value: Any, where: str) -> Any:
     try:
         return TypeAdapter(hint).validate_python(value)

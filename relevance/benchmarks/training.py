@@ -9,26 +9,18 @@ from typing import Literal
 from relevance.benchmarks.runs import Measured, Progress
 from relevance.models import BODIES, ModelConfig
 from relevance.report.tables import Table
-from relevance.training import TrainConfig, measure_speed
+from relevance.training import Speed, TrainConfig, measure_speed
 
 Sizes = Literal["cpu", "paper"]
 """Widths that a CPU can train (the defaults), or the paper's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Trained:
-    """One body of one size, and what it takes; see `relevance.training.Speed`."""
+class Trained(Speed):
+    """One body of one size, and what it takes."""
 
     body: str
     sizes: Sizes
-    parameters: int
-    scenes: float
-    queries: float
-    queries_alone: float
-    look: float
-    memory: int | None
-    device: str
-    bfloat16: bool
 
 
 def measure_training(

@@ -3,7 +3,7 @@
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Any, get_args
 
 import tyro
 
@@ -11,12 +11,18 @@ from relevance.cli.arguments import Command, DatasetArg, OptionalName, OptionalP
 from relevance.cli.terminal import bar, say
 
 
-def _train(preset: str, body: str | None = None) -> Callable[..., int]:
+def _start(preset: str, body: str | None) -> Any:
+    """The settings of a preset of training, with another body if one is named."""
     from relevance.training import TrainConfig
 
     start: TrainConfig = getattr(TrainConfig, preset)()
-    if body is not None:
-        start = start.with_body(body)
+    return start if body is None else start.with_body(body)
+
+
+def _train(preset: str, body: str | None = None) -> Callable[..., int]:
+    from relevance.training import TrainConfig
+
+    start = _start(preset, body)
 
     # --preset is a setting of TrainConfig itself.
     def train(
@@ -43,9 +49,7 @@ def _train(preset: str, body: str | None = None) -> Callable[..., int]:
 def _ship(preset: str, body: str | None = None) -> Callable[..., int]:
     from relevance.training import TrainConfig
 
-    start: TrainConfig = getattr(TrainConfig, preset)()
-    if body is not None:
-        start = start.with_body(body)
+    start = _start(preset, body)
 
     def ship(
         dataset: DatasetArg,

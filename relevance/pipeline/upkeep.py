@@ -16,7 +16,7 @@ from relevance.pipeline.preparing import change_over, clear, labelling_of, resum
 from relevance.pipeline.scenes import generated
 from relevance.pipeline.settings import ShardSpec, load_config, shards_of
 from relevance.scene import PREDICATES
-from relevance.store import TABLES, Dataset, DatasetError, Labelling
+from relevance.store import Dataset, DatasetError, Labelling
 
 REFUSED_SHARE = 0.01
 """Share of the replayed plans that the replay may refuse."""
@@ -67,8 +67,7 @@ def refused(dataset: Dataset) -> str | None:
 
     Then those plans that were not replayed cannot be believed either.
     """
-    files = [file for table in TABLES for file in dataset.files(table)] + dataset.files_beside()
-    unreadable = {file for file in files if _cut(dataset, file)}
+    unreadable = {file for file in dataset.files("plans") if _cut(dataset, file)}
     with dataset.connect(without=unreadable, names=["plans"]) as connection:
         query = "select count(replay_ok), count(*) filter (not replay_ok) from plans"
         [(replayed, bad)] = connection.execute(query).fetchall()

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from relevance.configs import dotted
 from relevance.models import BODIES
 from relevance.store import replacing
 from relevance.training.checkpoints import load_checkpoint, save_checkpoint
@@ -77,25 +78,15 @@ chose.
 def command(config: TrainConfig, root: Path) -> str:
     """The command line that ships this model: the preset, and what differs from it."""
     make = getattr(TrainConfig, config.preset, TrainConfig)
-    before = _flat(asdict(make().with_body(config.model.body)))
+    before = dotted(asdict(make().with_body(config.model.body)))
     changed = {
         key: value
-        for key, value in _flat(asdict(config)).items()
+        for key, value in dotted(asdict(config)).items()
         if value != before.get(key) and key not in ("preset", "device", "threads", "model.body")
     }
     preset = [f"--preset {config.preset}"] if make is not TrainConfig else []
     words = [f"relevance ship {root}", *preset, f"--model.body {config.model.body}"]
     return " ".join([*words, *(_flag(key, value) for key, value in changed.items())])
-
-
-def _flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{before}{key}.")
-        else:
-            flat[f"{before}{key}"] = value
-    return flat
 
 
 def _flag(key: str, value: Any) -> str:
