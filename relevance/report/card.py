@@ -31,7 +31,7 @@ from relevance.report.style import (
 )
 from relevance.report.tables import Statistics, Table, cell, statistics
 from relevance.scene import FAMILIES
-from relevance.store import Dataset
+from relevance.store import Dataset, decode
 
 PAGE = "README.md"
 MADE_WITH = ("relevance", "numpy", "pybullet", "casadi", "numba", "pyarrow", "duckdb")
@@ -326,10 +326,10 @@ def _drawn(dataset: Dataset, family: str) -> Figure | None:
         return None
     wanted = {scene_id for scene_id, _, _ in rows}
     images = {
-        sample.key: sample.image
+        members["__key__"]: decode(members).image
         for split, shard in sorted({(split, shard) for _, split, shard in rows})
-        for sample in dataset.samples(split, [shard])
-        if sample.key in wanted
+        for members in dataset.undecoded(split, shard)
+        if members["__key__"] in wanted
     }
     figure = Figure(figsize=(_WIDTH, 1.12 * -(-len(rows) // 4)), layout="constrained")
     grid = figure.subplots(-(-len(rows) // 4), 4, squeeze=False).ravel()

@@ -19,7 +19,7 @@ from relevance.scene.geometry import packed
 NEAR = 0.01
 """Narrowest gap of a crowded box to its neighbour, m. A finger beside a box takes 34 mm with its
 clearance, so many boxes must leave before their neighbour can be taken from that side. At 26 mm
-11% of the same-plane queries are relevant, at 10 mm the paper's 14%."""
+10 to 11% of the same-plane queries are relevant, at 10 mm 13 to 14% (the paper's 14)."""
 CENTRED = 0.1
 """How far off a neighbour's middle a crowded box may stand, as a share of its half extent."""
 OVER = {"on": 0.2, "stacks": 0.25}
