@@ -28,7 +28,7 @@ from relevance.planner.kernels.kinematics import (
     reach_interval,
 )
 from relevance.planner.kernels.native import call
-from relevance.planner.pose import FOUND, NONE
+from relevance.planner.kernels.planar import FOUND, NONE
 from relevance.robot import ARM, LINKS, panda, panda_urdf
 from relevance.scene import Box
 from relevance.scene.geometry import UPRIGHT, rectangle_gap, upright

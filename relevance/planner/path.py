@@ -18,6 +18,7 @@ from numba import njit
 
 from relevance.planner.grasps import bodies, carried, hand_target, pick_target, upper_bodies
 from relevance.planner.kernels.boxes import (
+    apart,
     banded_solve,
     body_pose,
     dense_solve,
@@ -60,6 +61,8 @@ ALLOWED = 1e-3
 """Penetration up to which a plan holds, m."""
 FAR = 0.01
 """Distances beyond this are not computed, m."""
+LONGEST = 1.3
+"""Farther from an axis of the arm nothing is that moves with it, m: what a radian can shift it."""
 SMALL_STEP = 2e-3
 """Gauss-Newton stops after a step below this, rad; what is left is of the order of its square."""
 ROUGH_STEP = 1e-2
@@ -241,13 +244,16 @@ def distances(arm, q, bodies, obstacles, out):
 
 @njit(cache=True)
 def assemble(
-    X, arm, bodies, obstacles, margin, samples, targets, smooth, eq, ineq, limit, mu, gain, band,
-    g,
+    X, arm, bodies, obstacles, margin, samples, targets, seen, room, smooth, eq, ineq, limit, mu,
+    gain, band, g,
 ):  # fmt: skip
     """Merit and Gauss-Newton model of the rows 1..T-1.
 
     With a gain above 0, the multipliers (eq, ineq, limit) are first moved along the violations.
-    Returns (merit, violation) and fills band (n, 3 * ARM) as `banded_solve` wants it, g (n,).
+    seen (S, 7), room (S, B): by how much each body was clear of everything at a configuration of
+    each sample (m; 0 where it never was); it is not looked at again before it can have moved that
+    far from there. Returns (merit, violation) and fills band (n, 3 * ARM) as `banded_solve` wants
+    it, g (n,).
     """
     T = len(X) - 1
     merit, worst = 0.0, 0.0
@@ -296,15 +302,27 @@ def assemble(
         t, alpha = int(samples[n, 0]), samples[n, 1]
         for i in range(ARM):
             q[i] = X[t, i] if alpha == 0.0 else (1 - alpha) * X[t, i] + alpha * X[t + 1, i]
-        look_at_frames(arm, q)
+        looked = False
         for b in range(len(bodies.link)):
+            shift = 0.0
+            for i in range(ARM):
+                shift += LONGEST * abs(q[i] - seen[n, b, i])
+            if room[n, b] > shift:
+                continue
+            assign(seen[n, b], q)
+            if not looked:
+                look_at_frames(arm, q)
+                looked = True
             start = bodies.link[b] * FRAME
             frame = arm.frames_y[start : start + FRAME]
             body_pose(frame, bodies.centre[b], p, R)
+            room[n, b] = 1.0
             for w in range(len(obstacles)):
-                reach = bodies.radius[b] + margin[b, w]
-                if ineq[n, b, w] == 0.0 and not near(p, reach, obstacles[w]):
+                gap = apart(p, bodies.radius[b] + margin[b, w], obstacles[w])
+                if ineq[n, b, w] == 0.0 and gap > 0:
+                    room[n, b] = min(room[n, b], gap)
                     continue
+                room[n, b] = 0.0
                 value = margin[b, w] - separation(
                     p, R, bodies.half[b], obstacles[w], normal, contact
                 )
@@ -343,12 +361,14 @@ def solve(X, arm, bodies, obstacles, margin, samples, targets):
     smooth, band, g = smoothness(T), np.zeros((n, WIDTH)), np.zeros(n)
     eq, limit = np.zeros((T + 1, 6)), np.zeros((T + 1, ARM, 2))
     ineq = np.zeros((len(samples), len(bodies.link), len(obstacles)))
+    room = np.zeros((len(samples), len(bodies.link)))
+    seen = np.zeros((len(samples), len(bodies.link), ARM))
     old, step = X.copy(), np.zeros(n)
     mu, gain, worst = 1000.0, 0.0, 1e9
     for outer in range(8):
         merit, worst = assemble(
-            X, arm, bodies, obstacles, margin, samples, targets, smooth, eq, ineq, limit, mu, gain,
-            band, g,
+            X, arm, bodies, obstacles, margin, samples, targets, seen, room, smooth, eq, ineq,
+            limit, mu, gain, band, g,
         )  # fmt: skip
         for _ in range(12):
             for i in range(n):
@@ -368,8 +388,8 @@ def solve(X, arm, bodies, obstacles, margin, samples, targets):
                     for i in range(ARM):
                         X[t, i] = old[t, i] + scale * step[(t - 1) * ARM + i]
                 new, worst = assemble(
-                    X, arm, bodies, obstacles, margin, samples, targets, smooth, eq, ineq,
-                    limit, mu, 0.0, band, g,
+                    X, arm, bodies, obstacles, margin, samples, targets, seen, room, smooth, eq,
+                    ineq, limit, mu, 0.0, band, g,
                 )  # fmt: skip
                 if new <= merit + 1e-4 * scale * slope + 1e-12:
                     break

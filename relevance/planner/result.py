@@ -49,7 +49,7 @@ class Counts:
 
 @dataclass(slots=True, kw_only=True)
 class Seconds:
-    """CPU seconds, in all and by bound; guide is the time spent on scoring."""
+    """CPU seconds, in all and by bound: pose with the search around it, guide for the scores."""
 
     total: float = 0.0
     pose: float = 0.0

@@ -18,13 +18,14 @@ import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache, partial
-from itertools import islice
+from itertools import compress, islice
 
 from relevance.planner import logic
 from relevance.planner.checking import broken
 from relevance.planner.compiling import compile_once
 from relevance.planner.grasps import fits, grasps
 from relevance.planner.guides import Guide, ask, rounds
+from relevance.planner.kernels.planar import reaching_into
 from relevance.planner.keyframes import KeyframeBound
 from relevance.planner.path import Motion, PathBound
 from relevance.planner.pose import PoseBound
@@ -38,7 +39,7 @@ from relevance.planner.result import (
     movable_names,
     replayed,
 )
-from relevance.scene import Box, Goal, Scene, footprint_gap, goal_holds
+from relevance.scene import Box, Goal, Scene, goal_holds
 
 TRIES = 200
 """How many sets are looked at to say what stands in the way."""
@@ -216,7 +217,9 @@ class _Search:
                     undecided = self.cut or problem.open
                     status = "limit" if undecided and self._might() else "infeasible"
                 reason = reason or self._exhausted(status, blocking)
-        problem.seconds.total = time.process_time() - began
+        seconds = problem.seconds
+        seconds.total = time.process_time() - began
+        seconds.pose = seconds.total - seconds.keyframe - seconds.path - seconds.guide
         if not found:
             assert status is not None
             return PlanResult(
@@ -460,16 +463,10 @@ class _Search:
             for grasp in self.pose.grasps(subject.name)
             for part in grasp.parts
         )
-        near = {reference.name}
-        for x, y, angle, a, b in problem.goal_regions(reference):
-            area = Box(
-                name="area",
-                size=(2 * (a + spread) + 0.02, 2 * (b + spread) + 0.02, 1.0),
-                position=(x, y, 0.5),
-                yaw=angle,
-                color=(0.0, 0.0, 0.0),
-            )
-            near |= {box.name for box in problem.scene.objects if footprint_gap(area, box) <= 0}
+        boxes = problem.obstacles[: len(problem.boxes)]
+        near, wider = {reference.name}, spread + 0.01
+        for area in problem.goal_regions(reference):
+            near.update(compress(problem.boxes, reaching_into(area, wider, boxes)))
         return frozenset(near) - {subject.name}
 
     def _in_the_way(self, chosen: frozenset[str]) -> frozenset[str]:

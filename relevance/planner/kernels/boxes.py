@@ -133,6 +133,15 @@ def near(p, radius, obstacle):
 
 
 @njit(cache=True)
+def apart(p, radius, obstacle):
+    """By how much a sphere (centre p, radius in m) is clear of the obstacle, at least, m; 0 or less
+    where they may touch. Its footprint is a disk."""
+    over = abs(p[2] - obstacle[2]) - obstacle[6] - radius
+    dx, dy = p[0] - obstacle[0], p[1] - obstacle[1]
+    return max(over, math.sqrt(dx * dx + dy * dy) - obstacle[7] - radius)
+
+
+@njit(cache=True)
 def banded_solve(band, b):
     """Solve A x = b in place, A symmetric positive definite; band[j, d] = A[j + d, j].
 

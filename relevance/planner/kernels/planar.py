@@ -1,0 +1,225 @@
+"""The downward hand in the plane: what is in its way, and where a held box is free.
+
+A box in the hand is a set of rectangles that share one angle (box, finger tips, fingers, palm),
+each with the height of its underside; it comes straight down, so an obstacle matters to a part
+iff it rises above that underside. Whether a free pose exists in a region is decided by branch
+and bound over (x, y, angle): clearance is Lipschitz, so a cell whose centre overlaps by more than
+its radius holds no free pose.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from relevance.scene.geometry import UPRIGHT, rectangle_gap, upright
+
+MARGIN = 0.003
+"""Clearance that placements keep, m; the later bounds ask for less, so they never refuse it."""
+PICK_MARGIN = 0.003
+"""Clearance of the gripper around a box that it takes, m."""
+COMFORT = 0.008
+"""Clearance beyond MARGIN with which a pose is taken at once, m."""
+NODE_LIMIT = 4000
+MAX_LEVEL = 6
+TURN, TURN_MARGIN, ANY_TURN = 0.1, 0.02, 4.0
+"""What a turn of the last joint counts against a distance, m/rad (less than the hand is long);
+what it keeps from its limit, and a half width that is none, rad."""
+HAND_REACH = 0.2
+"""Farther from a box nothing is in the way of the hand that takes it, m."""
+
+FOUND, NONE, UNDECIDED = 1, 0, 2
+
+
+@njit(cache=True)
+def pick_blockers(i, axes, parts, obstacles, room, blocking):
+    """Fill blocking (G, N) bool: which boxes are in the way of taking box i with each grasp.
+
+    axes (G,), parts (G, 5, 5): of the grasps. obstacles (N, UPRIGHT): all the boxes. room: asked
+    for around the hand, m. Returns how close the closest decision was, m.
+    """
+    closest = 1.0
+    o = obstacles[i]
+    bottom, top = o[2] - o[6], o[2] + o[6]
+    for k in range(len(obstacles)):
+        other = obstacles[k : k + 1]
+        dx, dy = o[0] - other[0, 0], o[1] - other[0, 1]
+        apart = math.sqrt(dx * dx + dy * dy) - o[7] - other[0, 7]
+        for g in range(len(axes)):
+            blocking[g, k] = False
+            if k == i or apart > HAND_REACH:
+                continue
+            angle = o[3] + axes[g] * math.pi / 2
+            gap = clearance(o[0], o[1], angle, bottom, parts[g, 1:], other) - room
+            if other[0, 2] - other[0, 6] >= top - 2e-3:  # what overhangs blocks the way up
+                over = clearance(o[0], o[1], angle, top, parts[g, :1], other)
+                gap = min(gap, over + PICK_MARGIN - room)
+            blocking[g, k] = gap < 0
+            closest = min(closest, abs(gap))
+    return closest
+
+
+@njit(cache=True)
+def reaching_into(area, wider, obstacles):
+    """Which obstacles (W, UPRIGHT) overlap, seen from above, a rectangle (5,: centre x, y, angle,
+    half extents) that is this much wider on all sides, m: (W,) bool."""
+    found = np.zeros(len(obstacles), np.bool_)
+    c, s = math.cos(area[2]), math.sin(area[2])
+    for w in range(len(obstacles)):
+        o, a, b = obstacles[w], area[3] + wider, area[4] + wider
+        gap = rectangle_gap(area[0], area[1], c, s, a, b, o[0], o[1], o[8], o[9], o[4], o[5])
+        found[w] = gap <= 0
+    return found
+
+
+@njit(cache=True)
+def clearance(x, y, angle, bottom, parts, obstacles):
+    """Smallest separating-axis distance of parts and the obstacles that rise above them, m."""
+    best = 1.0
+    c, s = math.cos(angle), math.sin(angle)
+    for i in range(len(parts)):
+        offset, left = parts[i, 0], parts[i, 1]
+        along, across, under = parts[i, 2], parts[i, 3], parts[i, 4]
+        px, py = x + c * offset - s * left, y + s * offset + c * left
+        radius = math.sqrt(along * along + across * across)
+        for k in range(len(obstacles)):
+            o = obstacles[k]
+            above = o[2] + o[6] - bottom - under
+            if above <= -MARGIN or (under == 0.0 and abs(above) < 1e-6):  # the box's own support
+                continue
+            flat = radius + o[7] + best
+            dx, dy = o[0] - px, o[1] - py
+            if dx * dx + dy * dy > flat * flat:
+                continue
+            gap = rectangle_gap(px, py, c, s, along, across, o[0], o[1], o[8], o[9], o[4], o[5])
+            best = min(best, gap)
+    return best
+
+
+@njit(cache=True)
+def volumes(parts, pose, bottom, top, sky):
+    """The box at a pose and the gripper that puts it there, as rows up to the sky, (P, UPRIGHT)."""
+    rows = np.empty((len(parts), UPRIGHT))
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(len(parts)):
+        low, high = bottom + parts[i, 4], top if i == 0 else sky
+        x = pose[0] + c * parts[i, 0] - s * parts[i, 1]
+        y = pose[1] + s * parts[i, 0] + c * parts[i, 1]
+        upright(
+            x, y, (low + high) / 2, pose[2], parts[i, 2], parts[i, 3], (high - low) / 2, rows[i]
+        )
+    return rows
+
+
+@njit(cache=True)
+def slack(x, y, angle, bottom, parts, obstacles, table, base, reach, enough):
+    """How well (x, y, angle) satisfies clearance, table edge and reach; feasible iff >= 0. m.
+
+    parts (V, 5, 5), reach (V, 4: distances near and far, middle and half width of the finger axis'
+    turn against the bearing): of the ways in which the hand may hold the box; the best counts.
+    Below `-enough` it is not computed to the end. Returns (slack, which way).
+    """
+    c, s = abs(math.cos(angle)), abs(math.sin(angle))
+    along, across = parts[0, 0, 2], parts[0, 0, 3]
+    shared = table[0] - abs(x) - c * along - s * across
+    shared = min(shared, table[1] - abs(y) - s * along - c * across)
+    r = math.sqrt((x - base[0]) ** 2 + (y - base[1]) ** 2)
+    if shared < -0.2:
+        return shared, 0
+    shared = min(shared, clearance(x, y, angle, bottom, parts[0, :1], obstacles) - MARGIN)
+    if shared < -enough:
+        return shared, 0
+    best, which = -1.0, 0
+    for v in range(len(parts)):
+        worst = min(shared, min(reach[v, 1] - r, r - reach[v, 0]))
+        if reach[v, 3] < ANY_TURN:
+            left = parts[v, -1, 1]
+            hx, hy = x - left * math.sin(angle) - base[0], y + left * math.cos(angle) - base[1]
+            off = angle - math.atan2(hy, hx) - reach[v, 2]
+            off -= 2 * math.pi * math.floor(off / (2 * math.pi) + 0.5)
+            worst = min(worst, TURN * (reach[v, 3] - TURN_MARGIN - abs(off)))
+        if worst > best:
+            hand = clearance(x, y, angle, bottom, parts[v, 1:], obstacles) - MARGIN
+            worst = min(worst, hand)
+            if worst > best:
+                best, which = worst, v
+        if best >= COMFORT or best >= shared:
+            break
+    return best, which
+
+
+@njit(cache=True)
+def find_pose(region, prefer, bottom, parts, obstacles, table, base, reach, ease, pose):
+    """Branch and bound for a free pose whose centre lies in a rectangle.
+
+    region: centre x, y, angle, half extents (5,). prefer (x, y): where to look first. parts,
+    reach: as `slack` has them. ease: how much every constraint is relaxed, m. Fills pose
+    (x, y, angle of the finger axis, which of the parts) with the first comfortable pose of the
+    coarsest level that has a free one, or the clearest of that level.
+    Returns (FOUND | NONE | UNDECIDED, the slack of the best pose seen, m).
+    """
+    a, b = region[3], region[4]
+    c, s = math.cos(region[2]), math.sin(region[2])
+    nx, ny, na = max(1, math.ceil(a / 0.025)), max(1, math.ceil(b / 0.025)), 6
+    hx, hy, ha = a / nx, b / ny, math.pi / (2 * na)
+    spin = 0.0
+    for v in range(len(parts)):
+        for i in range(parts.shape[1]):
+            offset, left = abs(parts[v, i, 0]), abs(parts[v, i, 1])
+            if left == 0.0:
+                outer = offset + math.sqrt(parts[v, i, 2] ** 2 + parts[v, i, 3] ** 2)
+            else:
+                outer = math.sqrt((offset + parts[v, i, 2]) ** 2 + (left + parts[v, i, 3]) ** 2)
+            spin = max(spin, outer)
+    count = nx * ny * na
+    cells, key, order = np.empty((count, 3)), np.empty(nx * ny), np.empty(nx * ny, np.int64)
+    for n in range(nx * ny):  # sorted as they come: numpy's own sorting takes seconds to compile
+        u, v = -a + (2 * (n // ny) + 1) * hx, -b + (2 * (n % ny) + 1) * hy
+        wx, wy = region[0] + c * u - s * v, region[1] + s * u + c * v
+        far, m = (wx - prefer[0]) ** 2 + (wy - prefer[1]) ** 2, n
+        while m > 0 and key[m - 1] > far:
+            key[m], order[m] = key[m - 1], order[m - 1]
+            m -= 1
+        key[m], order[m] = far, n
+    for n in range(count):
+        at = order[n // na]
+        cells[n, 0] = -a + (2 * (at // ny) + 1) * hx
+        cells[n, 1] = -b + (2 * (at % ny) + 1) * hy
+        cells[n, 2] = (2 * (n % na) + 1) * ha
+    evaluations = 0
+    for level in range(MAX_LEVEL + 1):
+        lipschitz = math.sqrt(hx * hx + hy * hy) + spin * ha
+        best = -1.0
+        keep = np.empty(len(cells), np.bool_)
+        for n in range(len(cells)):
+            x = region[0] + c * cells[n, 0] - s * cells[n, 1]
+            y = region[1] + s * cells[n, 0] + c * cells[n, 1]
+            value, which = slack(
+                x, y, cells[n, 2], bottom, parts, obstacles, table, base, reach, lipschitz + ease
+            )
+            value += ease
+            evaluations += 1
+            keep[n] = value + lipschitz >= 0
+            if value > best:
+                best = value
+                if value >= 0:
+                    pose[0], pose[1], pose[2], pose[3] = x, y, cells[n, 2], which
+            if best >= COMFORT:
+                break
+        if best >= 0:
+            return FOUND, best
+        alive = cells[keep]
+        if len(alive) == 0:
+            return NONE, best
+        if level == MAX_LEVEL or evaluations + 8 * len(alive) > NODE_LIMIT + count:
+            return UNDECIDED, best
+        hx, hy, ha = hx / 2, hy / 2, ha / 2
+        cells = np.empty((8 * len(alive), 3))
+        for n in range(len(alive)):
+            for child in range(8):
+                cells[8 * n + child, 0] = alive[n, 0] + (hx if child & 1 else -hx)
+                cells[8 * n + child, 1] = alive[n, 1] + (hy if child & 2 else -hy)
+                cells[8 * n + child, 2] = alive[n, 2] + (ha if child & 4 else -ha)
+    return UNDECIDED, best
