@@ -364,7 +364,7 @@ def solve(X, arm, bodies, obstacles, margin, samples, targets):
     room = np.zeros((len(samples), len(bodies.link)))
     seen = np.zeros((len(samples), len(bodies.link), ARM))
     old, step = X.copy(), np.zeros(n)
-    mu, gain, worst = 1000.0, 0.0, 1e9
+    mu, gain, worst = 3000.0, 0.0, 1e9
     for outer in range(8):
         merit, worst = assemble(
             X, arm, bodies, obstacles, margin, samples, targets, seen, room, smooth, eq, ineq,
@@ -397,7 +397,7 @@ def solve(X, arm, bodies, obstacles, margin, samples, targets):
             merit = new
             if scale * longest < (SMALL_STEP if outer else ROUGH_STEP):
                 break
-        if worst < TOLERANCE and outer > 0:
+        if worst < TOLERANCE:
             return worst
         mu, gain = min(mu * 10.0, 1e5), mu
     return worst
