@@ -94,55 +94,56 @@ def _deep(size: tuple[float, float, float]) -> Family:
     depth = min(DEPTH, max(height - 0.012, 0.3 * height, min(0.010, height - GROUND)))
     sound = min(depth, height - GROUND) >= GRIP
     above = height / 2 - depth + hand.tip
-    for axis in (0, 1) if length <= width else (1, 0):
+    axes = (0, 1) if length <= width else (1, 0)
+    parts = np.empty((2, 1 + len(hand.parts), 5))
+    for axis in axes:
         closed = size[axis] / 2
         opening = closed + SPREAD
         if opening > hand.max_opening or not sound:
             continue
-        parts = np.empty((2 + len(hand.fingers), 5))
-        parts[0] = 0.0, 0.0, closed, size[1 - axis] / 2, 0.0
-        parts[1:-1] = hand.fingers
-        parts[1:-1, 0] += hand.sides * opening
-        parts[-1] = hand.palm
-        parts[1:, 4] += height / 2 + above  # of the hand over the box's bottom
+        one = parts[len(found)]
+        one[0] = 0.0, 0.0, closed, size[1 - axis] / 2, 0.0
+        one[1:] = hand.parts
+        one[1:-1, 0] += hand.sides * opening
+        one[1:, 4] += height / 2 + above  # of the hand over the box's bottom
         found.append(
             Grasp(
                 axis=axis, opening=opening, closed=closed, above=above, depth=depth, shift=0.0,
-                price=0.0, parts=parts,
+                price=0.0, parts=one,
             )
         )  # fmt: skip
-    return _family(found)
+    return _family(found, parts[: len(found)])
 
 
 @lru_cache(maxsize=1024)
 def _others(size: tuple[float, float, float]) -> Family:
-    found = []
+    found, parts = [], []
     for deep in _deep(size).grasps:
         most = min(size[1 - deep.axis] / 2 - INSET, FARTHEST)
         shifts = (0.0, 0.5 * most, -0.5 * most, most, -most) if most > INSET / 2 else (0.0,)
         depths = (deep.depth, *(depth for depth in SHALLOW if depth < deep.depth - 0.002))
-        for shift in shifts:
-            for depth in depths:
-                if (shift, depth) == (0.0, deep.depth):
-                    continue
-                rise = deep.depth - depth
-                parts = deep.parts.copy()
-                parts[1:, 1] += shift
-                parts[1:, 4] += rise
-                found.append(
-                    Grasp(
-                        axis=deep.axis, opening=deep.opening, closed=deep.closed,
-                        above=deep.above + rise, depth=depth, shift=shift,
-                        price=PRICE * (rise + abs(shift)), parts=parts,
-                    )
-                )  # fmt: skip
-    return _family(found)
+        ways = [(shift, depth) for shift in shifts for depth in depths][1:]  # without the deep one
+        if not ways:
+            continue
+        shifted, depth = np.array(ways).T
+        there = np.repeat(deep.parts[None], len(ways), axis=0)
+        there[:, 1:, 1] += shifted[:, None]
+        there[:, 1:, 4] += (deep.depth - depth)[:, None]
+        parts.append(there)
+        for (shift, depth), one in zip(ways, there, strict=True):
+            rise = deep.depth - depth
+            found.append(
+                Grasp(
+                    axis=deep.axis, opening=deep.opening, closed=deep.closed,
+                    above=deep.above + rise, depth=depth, shift=shift,
+                    price=PRICE * (rise + abs(shift)), parts=one,
+                )
+            )  # fmt: skip
+    return _family(found, np.concatenate(parts) if parts else np.empty((0, 5, 5)))
 
 
-def _family(found: list[Grasp]) -> Family:
-    axes = np.array([grasp.axis for grasp in found], np.int64)
-    parts = np.array([grasp.parts for grasp in found]) if found else np.empty((0, 5, 5))
-    return Family(tuple(found), axes, parts)
+def _family(found: list[Grasp], parts: np.ndarray) -> Family:
+    return Family(tuple(found), np.array([grasp.axis for grasp in found], np.int64), parts)
 
 
 def fits(box: Box) -> bool:
@@ -222,9 +223,10 @@ def _bodies(rows: list[tuple[int, np.ndarray, np.ndarray]]) -> Bodies:
 class _Hand:
     """The downward hand as rectangles, like `Grasp.parts`, heights relative to its origin."""
 
-    fingers: np.ndarray
+    parts: np.ndarray
+    """(4, 5): finger tips and fingers, at opening 0, then the palm."""
     sides: np.ndarray
-    palm: np.ndarray
+    """Which way opening moves each finger part along the finger axis."""
     tip: float
     max_opening: float
 
@@ -242,9 +244,8 @@ def _hand() -> _Hand:
     _, centre, half = arm.arm[-1]
     reach = np.abs(centre) + half
     return _Hand(
-        fingers=np.array(rows),
+        parts=np.array([*rows, (0.0, 0.0, reach[1], reach[0], -(centre[2] + half[2]))]),
         sides=np.array(sides),
-        palm=np.array([0.0, 0.0, reach[1], reach[0], -(centre[2] + half[2])]),
         tip=arm.finger_tip,
         max_opening=arm.max_opening,
     )

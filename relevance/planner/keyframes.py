@@ -48,6 +48,8 @@ less, the pull of short joint motion drags boxes into wells between obstacles.""
 SMALL_STEP = 1e-3
 """Gauss-Newton stops after a step below this, rad or m; what is left is of the order of its
 square."""
+ROUGH_STEP = 1e-2
+"""The same before the multipliers are set for the first time, rad or m."""
 _OUTER, _INNER = 8, 12
 
 
@@ -208,7 +210,7 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
     index = np.zeros(16, np.int64)
     row, part = np.zeros(16), np.zeros(ARM)
     p, R, normal, contact = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
-    o, target = np.zeros(UPRIGHT), np.zeros(4)
+    there, target = np.zeros((len(obstacles), UPRIGHT)), np.zeros(4)
     for k in range(2 * m):
         for i in range(ARM):
             a = k * ARM + i
@@ -266,6 +268,13 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                 )
                 merit += got
                 worst = max(worst, violated)
+        for w in range(len(obstacles)):
+            other = switches.moved[w]
+            assign(there[w], obstacles[w])
+            if 0 <= other < j:
+                a, o = first + 3 * other, there[w]
+                yaw, height = x[a + 2] - switches.turn[other, 0], switches.turn[other, 1]
+                upright(x[a], x[a + 1], height, yaw, o[4], o[5], o[6], o)
         for b in range(switches.n_bodies[k]):
             link = switches.link[k, b] * FRAME
             frame = arm.frames_y[link : link + FRAME]
@@ -274,18 +283,11 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                 held = b == switches.n_bodies[k] - 1
                 if not switches.stands[k, w]:
                     continue
-                assign(o, obstacles[w])
+                o, other = there[w], switches.moved[w]
                 if placing and held:  # what is not above its support is not in its way
                     under = switches.turn[j, 1] - switches.half[k, b, 2]
                     if w == switches.support[j] or o[2] + o[6] <= under + 1e-6:
                         continue
-                other = switches.moved[w]
-                free = other >= 0 and other < j
-                if free:
-                    there = first + 3 * other
-                    yaw = x[there + 2] - switches.turn[other, 0]
-                    height = switches.turn[other, 1]
-                    upright(x[there], x[there + 1], height, yaw, o[4], o[5], o[6], o)
                 if ineq[k, b, w] == 0.0 and not near(p, switches.radius[k, b] + CLEARANCE, o):
                     continue
                 d = separation(p, R, switches.half[k, b], o, normal, contact)
@@ -297,11 +299,10 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                 for i in range(ARM):
                     index[i], row[i] = k * ARM + i, -part[i]
                 count = np.int64(ARM)
-                if free:
-                    there = first + 3 * other
+                if 0 <= other < j:
                     spin = normal[1] * (contact[0] - o[0]) - normal[0] * (contact[1] - o[1])
                     for i in range(3):
-                        index[count] = there + i
+                        index[count] = first + 3 * other + i
                         row[count] = spin if i == 2 else normal[i]
                         count += 1
                 got, violated = _push(H, g, index, row, count, value, ineq[k, b, w], mu, 0.0)
@@ -377,7 +378,7 @@ def solve(x, arm, switches, p0, weight):
                     break
                 scale *= 0.4
             merit = new
-            if scale * longest < SMALL_STEP:
+            if scale * longest < (SMALL_STEP if outer else ROUGH_STEP):
                 break
         if worst < TOLERANCE / 2 and outer > 0:
             return worst
