@@ -12,7 +12,8 @@ from relevance.planner import compiling, plan, search
 FRESH = """
 import sys
 from numba.core.dispatcher import Dispatcher
-from relevance.planner import compiling, keyframes, path, plan, pose, warm_up
+from relevance.planner import compiling, keyframes, plan, warm_up
+from relevance.planner.kernels import motions, planar
 sys.path.insert(0, "tests")
 from planning import tasks
 
@@ -26,13 +27,13 @@ def known():
 
 todo = tasks(24, 5)
 compiling.other_half()
-assert keyframes.solve.overloads and path.retreat.overloads
-assert not pose.find_pose.overloads and not path.motion.overloads
+assert keyframes.solve.overloads and motions.retreat.overloads
+assert not planar.find_pose.overloads and not motions.motion.overloads
 compiling.first_half()
-assert pose.find_pose.overloads and path.motion.overloads
+assert planar.find_pose.overloads and motions.motion.overloads
 warm_up()
 before = known()
-assert before["relevance.planner.path.motion"] == 1
+assert before["relevance.planner.kernels.motions.motion"] == 1
 for scene, goal in todo:
     plan(scene, goal, replay=False)
 assert known() == before, {k: v for k, v in known().items() if before[k] != v}

@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relevance import _kernel_cache
-from relevance.planner import path, pose
 from relevance.planner.grasps import bodies, grasps
-from relevance.planner.kernels import native
+from relevance.planner.kernels import motions, native, planar
 from relevance.planner.kernels.boxes import (
     banded_solve,
     separation,
@@ -271,12 +270,13 @@ def test_path_gradient_equals_finite_differences():
     multipliers = rng.uniform(0, 0.1, (7, 6)), rng.uniform(0, 0.1, shape), np.zeros((7, ARM, 2))
     margin = np.full(shape[1:], 0.05)
     band, g = np.zeros((5 * ARM, 3 * ARM)), np.zeros(5 * ARM)
-    at, smooth = arm_at(BASE), path.smoothness(6)
+    at, smooth = arm_at(BASE), motions.smoothness(6)
+    seen, room = np.zeros((*shape[:2], ARM)), np.zeros(shape[:2])
 
     def merit(rows):
-        return path.assemble(
-            rows, at, body, obstacles, margin, samples, targets, smooth, *multipliers,
-            7.0, 0.0, band, g,
+        return motions.assemble(
+            rows, at, body, obstacles, margin, samples, targets, seen, room, smooth,
+            *multipliers, 7.0, 0.0, band, g,
         )[0]  # fmt: skip
 
     merit(X)
@@ -295,7 +295,7 @@ def test_smoothness_is_the_hessian_of_the_cost():
     n = (T - 1) * ARM
     second = np.kron(np.diff(np.eye(T + 3), n=2, axis=0)[:, 2:-2], np.eye(ARM))
     expected = second.T @ second + 1e-6 * np.eye(n)
-    band = path.smoothness(T)
+    band = motions.smoothness(T)
     found = np.zeros((n, n))
     for j in range(n):
         for d in range(min(3 * ARM, n - j)):
@@ -317,12 +317,12 @@ def test_pairs_called_clear_are_clear_at_every_substep():
         if not hand_down(target, BASE, arm.lower, arm.upper, q):
             continue
         step = rng.normal(scale=0.08, size=ARM)
-        n = path.close_pairs(at, q, q + step, body, obstacles, pairs)
+        n = motions.close_pairs(at, q, q + step, body, obstacles, pairs)
         clear, skipped = clear + (n == 0), skipped + out.size - n
         for share in np.linspace(0, 1, 21):
-            path.distances(at, q + share * step, body, obstacles, out)
+            motions.distances(at, q + share * step, body, obstacles, out)
             out[tuple(pairs[:n].T)] = 1.0
-            assert out.min() >= path.CLEARANCE
+            assert out.min() >= motions.CLEARANCE
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -346,12 +346,12 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
         region = np.array([0.0, 0.0, 0.2, 0.05, 0.03])
         near, far = reach_interval(0.15)
         at = np.zeros(4)
-        reach = np.array([[near, far, 0.0, pose.ANY_TURN]])
+        reach = np.array([[near, far, 0.0, planar.ANY_TURN]])
         common = (0.0, grasp.parts[None], obstacles, table, BASE, reach)
-        status, _ = pose.find_pose(region, np.zeros(2), *common, 0.0, at)
+        status, _ = planar.find_pose(region, np.zeros(2), *common, 0.0, at)
         c, s = math.cos(0.2), math.sin(0.2)
         grid = max(
-            pose.slack(c * x - s * y, s * x + c * y, angle, *common, 0.0)[0]
+            planar.slack(c * x - s * y, s * x + c * y, angle, *common, 0.0)[0]
             for x in np.linspace(-0.05, 0.05, 15)
             for y in np.linspace(-0.03, 0.03, 9)
             for angle in np.linspace(0, math.pi, 24, endpoint=False)
@@ -361,7 +361,7 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
             assert grid < 0
         if status == FOUND:
             found += 1
-            assert pose.slack(*at[:3], *common, 0.0)[0] >= 0
+            assert planar.slack(*at[:3], *common, 0.0)[0] >= 0
             local = np.array([[c, s], [-s, c]]) @ at[:2]
             assert (np.abs(local) <= [0.05, 0.03]).all()
     assert refused > 3

@@ -10,7 +10,8 @@ from numba import njit
 
 from relevance.planner.grasps import bodies
 from relevance.planner.kernels.kinematics import FRAME, look_at_frames
-from relevance.planner.path import ALLOWED, Motion, dense_check, put_down
+from relevance.planner.kernels.motions import ALLOWED, dense_check
+from relevance.planner.path import Motion, put_down, upper_depth
 from relevance.planner.problem import Problem
 from relevance.planner.result import PlanResult
 from relevance.robot import HAND, panda
@@ -85,7 +86,7 @@ def penetration(scene: Scene, result: PlanResult) -> float:
         body = bodies(phase.opening, held if holding else None)
         margin, over = np.zeros((len(body.link), there.sum())), np.zeros((len(phase.q) - 1, 2))
         depth = dense_check(phase.q, problem.arm, body, obstacles[there], margin, over)
-        worst = max(worst, depth)
+        worst = max(worst, depth, upper_depth(problem, phase.q, obstacles[there][:-2]))
     return worst
 
 

@@ -23,8 +23,8 @@ from numba.core import config
 
 from relevance.planner.grasps import bodies, grasps, pick_target
 from relevance.planner.kernels.kinematics import functions
+from relevance.planner.kernels.motions import ROWS, VERTICAL, motion, retreat
 from relevance.planner.keyframes import KeyframeBound
-from relevance.planner.path import ROWS, VERTICAL, motion, retreat
 from relevance.planner.pose import Placement, PoseBound
 from relevance.planner.problem import Problem
 from relevance.robot import HOME

@@ -42,7 +42,6 @@ SKY = 2.0
 """Height up to which the hand and what is above it count as an obstacle, m."""
 
 
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Placement:
     """Where a moved box goes and how it is held."""
