@@ -45,7 +45,7 @@ TOLERANCE = 2e-4
 STAY = (100.0, 1e5)
 """Weights of a placement's distance from what the pose bound found (m^-2), tried in turn: with
 less, the pull of short joint motion drags boxes into wells between obstacles."""
-SMALL_STEP = 1e-3
+SMALL_STEP = 3e-3
 """Gauss-Newton stops after a step below this, rad or m; what is left is of the order of its
 square."""
 ROUGH_STEP = 1e-2
