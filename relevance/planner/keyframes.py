@@ -106,10 +106,13 @@ class KeyframeBound:
         self, order: tuple[str, ...], placements: list[Placement]
     ) -> tuple[np.ndarray, np.ndarray] | None:
         arm, at, problem, m = panda(), self.problem.arm, self.problem, len(order)
-        moved = np.full(len(problem.obstacles), -1)
-        stands = np.ones((2 * m, len(problem.obstacles)), np.bool_)
+        obstacles, every = problem.obstacles, problem.tall
+        if every:  # with the links near the base, which are over the robot's foot
+            at, obstacles = problem.whole_arm, obstacles[:-1]
+        moved = np.full(len(obstacles), -1)
+        stands = np.ones((2 * m, len(obstacles)), np.bool_)
         supports = np.full(m, len(problem.boxes))  # the table
-        widest = len(arm.arm) + 2 * len(arm.finger) + 1
+        widest = len(arm.arm) + every * len(arm.upper_arm) + 2 * len(arm.finger) + 1
         link, n_bodies = np.zeros((2 * m, widest), np.int64), np.zeros(2 * m, np.int64)
         centre, half = np.zeros((2 * m, widest, 3)), np.zeros((2 * m, widest, 3))
         radius = np.zeros((2 * m, widest))
@@ -136,7 +139,7 @@ class KeyframeBound:
             p0[3 * j : 3 * j + 3] = place.pose
             for k in (2 * j, 2 * j + 1):
                 held = carried(box, grasp, way) if k % 2 else None
-                body = bodies(grasp.opening, held)
+                body = bodies(grasp.opening, held, upper=every)
                 n_bodies[k] = count = len(body.link)
                 link[k, :count], centre[k, :count], half[k, :count], radius[k, :count] = body
                 stands[k, problem.index[name]] = False
@@ -147,7 +150,7 @@ class KeyframeBound:
             bounds[j, 2:] = self.pose.interval(bottom, box, grasp)
         x[14 * m :] = p0
         switches = Switches(
-            HOME, pick, place_z, turn, link, centre, half, radius, n_bodies, problem.obstacles,
+            HOME, pick, place_z, turn, link, centre, half, radius, n_bodies, obstacles,
             stands, moved, supports, problem.goal_region(reference, *p0[-3:-1]), bounds,
         )  # fmt: skip
         start = x.copy()
