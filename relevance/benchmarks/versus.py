@@ -174,18 +174,24 @@ def _row(part: str, task: Task, ours: dict[str, Any], other: dict[str, Any]) -> 
 
 def times_table(part: str, rows: Sequence[Versus]) -> Table:
     """CPU time of both, and the ratios of this planner's to the other's."""
-    ours, other = [row.cpu for row in rows], [row.cpu_other for row in rows]
-    ratios = [f"{ratio(ours, other, name):.2f}" if name in CHECKED else "-" for name in TIMES]
-    ratios[-1] = f"{max(ours) / max(other):.2f}"
+    lines: list[tuple[str | int, ...]] = []
+    both = [row for row in rows if row.status == row.status_other == "solved"]
+    for which, some in (("all tasks", rows), ("solved by both", both)):
+        if not some:
+            continue
+        ours, other = [row.cpu for row in some], [row.cpu_other for row in some]
+        ratios = [f"{ratio(ours, other, name):.2f}" if name in CHECKED else "-" for name in TIMES]
+        ratios[-1] = f"{max(ours) / max(other):.2f}"
+        lines += [
+            (f"this, {which}", len(some), *milliseconds(ours)),
+            (f"other, {which}", len(some), *milliseconds(other)),
+            (f"this over other, {which}", len(some), *ratios),
+        ]
     return Table(
         name=f"versus-{part}",
         title=f"This planner and the other, {part}, CPU time a task in ms (95% interval)",
         columns=("planner", "tasks", *TIMES),
-        rows=(
-            ("this", len(rows), *milliseconds(ours)),
-            ("other", len(rows), *milliseconds(other)),
-            ("this over other", len(rows), *ratios),
-        ),
+        rows=tuple(lines),
     )
 
 
