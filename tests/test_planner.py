@@ -29,6 +29,18 @@ def test_every_solved_plan_replays_and_reaches_its_goal(planned):
         assert goal_holds(scene.moved(result.final), goal, scene.robot)
 
 
+@pytest.mark.parametrize("at", [(-0.25, -0.12), (-0.25, 0.08), (-0.2, 0.12), (-0.15, -0.08)])
+def test_the_elbow_is_turned_aside_from_a_pole(at):
+    pole = Box(name="pole", size=(0.05, 0.05, 0.5), position=(*at, 0.25), color=GREY)
+    scene = Scene(objects=(pole, box("a", 0.1, 0.25, RED), box("c", 0.1, -0.25, BLUE)))
+    result = plan(scene, "on(a, c)")
+    assert result.status == "solved"
+    assert result.moved == ("a",)
+    assert result.replay is not None
+    assert result.replay.ok
+    assert penetration(scene, result) <= 1e-3
+
+
 def test_dense_check_of_the_plan_alone_equals_the_solvers(planned):
     for scene, _, result in planned:
         if result.status == "solved":

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import time
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +46,9 @@ TOLERANCE = 2e-4
 STAY = (100.0, 1e5)
 """Weights of a placement's distance from what the pose bound found (m^-2), tried in turn: with
 less, the pull of short joint motion drags boxes into wells between obstacles."""
+SWINGS = (0.0, 0.6, -0.6)
+"""By how much the elbow is turned aside in the first guess, rad, tried in turn where something
+tall could be in its way."""
 SMALL_STEP = 3e-3
 """Gauss-Newton stops after a step below this, rad or m; what is left is of the order of its
 square."""
@@ -153,13 +157,14 @@ class KeyframeBound:
             HOME, pick, place_z, turn, link, centre, half, radius, n_bodies, obstacles,
             stands, moved, supports, problem.goal_region(reference, *p0[-3:-1]), bounds,
         )  # fmt: skip
-        start = x.copy()
-        for stay in STAY:
+        start, elbow = x.copy(), x[2 : 14 * m : ARM]
+        for swing, stay in product(SWINGS if every else SWINGS[:1], STAY):
             weight[:] = stay
             if reference.name in order:  # the subject's region was laid out around it
                 j = order.index(reference.name)
                 weight[3 * j : 3 * j + 3] = 1e6
             x[:] = start
+            elbow += swing
             if solve(x, at, switches, p0, weight) <= TOLERANCE:
                 return x[: 14 * m].reshape(2 * m, ARM), x[14 * m :].reshape(m, 3)
         return None
