@@ -74,6 +74,19 @@ def test_a_goal_that_holds_already_takes_no_action() -> None:
     assert (result.status, result.actions, result.moved) == ("solved", (), ())
 
 
+@pytest.mark.parametrize(
+    ("scene", "most"),
+    zip(read_scenes(CASES / "leaning.jsonl"), (2, 3, 1, 2, 3, 3, 2), strict=True),
+    ids=lambda value: value.id if isinstance(value, Scene) else str(value),
+)
+@pytest.mark.xfail(strict=True, reason="the hand does not lean yet")
+def test_what_a_leaning_hand_can_take_is_taken(scene: Scene, most: int) -> None:
+    """rai solves these by moving `most` boxes with a hand that leans by 7 to 55 degrees."""
+    result = plan(scene, scene.goals[0])
+    assert result.status == "solved"
+    assert len(result.moved) <= most
+
+
 def test_an_arm_goes_around_a_pole() -> None:
     """Every link is looked at."""
     result = planned("tall-pole")
