@@ -289,6 +289,19 @@ def test_path_gradient_equals_finite_differences():
     assert np.abs(gradient).max() > 0.01
     np.testing.assert_allclose(gradient, numeric, atol=2e-4)
 
+    # What is not looked at anew, as it cannot have come near, changes nothing.
+    multipliers[1][:] = 0.0
+    merit(X)
+    for scale in (1e-3, 1e-2, 1e-1):
+        rows = X + rng.normal(scale=scale, size=X.shape)
+        kept, gradient = merit(rows), g.copy()
+        assert (room > 0).any()
+        seen_then, room_then = seen.copy(), room.copy()
+        room[:] = 0.0
+        assert merit(rows) == kept
+        np.testing.assert_array_equal(g, gradient)
+        seen[:], room[:] = seen_then, room_then
+
 
 def test_smoothness_is_the_hessian_of_the_cost():
     T = 6

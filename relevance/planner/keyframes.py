@@ -26,6 +26,7 @@ from relevance.planner.kernels.boxes import (
     near,
     point_gradient,
     separation,
+    step_length,
 )
 from relevance.planner.kernels.kinematics import (
     FRAME,
@@ -369,11 +370,7 @@ def solve(x, arm, switches, p0, weight):
                 step[i] = -g[i]
             if not dense_solve(H, step):
                 return 1e9
-            longest, slope = 0.0, 0.0
-            for i in range(n):
-                longest = max(longest, abs(step[i]))
-                slope += step[i] * g[i]
-            scale = min(1.0, 0.5 / max(longest, 1e-12))
+            longest, slope, scale = step_length(step, g)
             assign(old, x)
             new = merit
             for _ in range(8):

@@ -185,3 +185,14 @@ def dense_solve(A, b):
         for i in range(j, n):
             band[j, i - j] = A[i, j]
     return banded_solve(band, b)
+
+
+@njit(cache=True)
+def step_length(step, g):
+    """Largest entry of a Newton step, its slope along the gradient g, and the share of it that
+    moves nothing by more than 0.5 (rad or m)."""
+    longest, slope = 0.0, 0.0
+    for i in range(len(step)):
+        longest = max(longest, abs(step[i]))
+        slope += step[i] * g[i]
+    return longest, slope, min(1.0, 0.5 / max(longest, 1e-12))

@@ -22,6 +22,7 @@ from relevance.planner.kernels.boxes import (
     near,
     point_gradient,
     separation,
+    step_length,
 )
 from relevance.planner.kernels.kinematics import FRAME, look_at_frames, look_at_grasp
 from relevance.planner.kernels.rows import (
@@ -236,11 +237,7 @@ def solve(X, arm, bodies, obstacles, margin, samples, targets):
                 step[i] = -g[i]
             if not banded_solve(band, step):
                 return 1e9
-            longest, slope = 0.0, 0.0
-            for i in range(n):
-                longest = max(longest, abs(step[i]))
-                slope += step[i] * g[i]
-            scale = min(1.0, 0.5 / max(longest, 1e-12))
+            longest, slope, scale = step_length(step, g)
             for t in range(T + 1):
                 assign(old[t], X[t])
             new = merit
