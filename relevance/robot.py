@@ -26,6 +26,8 @@ HOME = np.array([0.0, -0.785398, 0.0, -2.356194, 0.0, 1.570796, 0.785398])
 """Franka's ready pose: hand down, high over the near part of the table, rad."""
 PADDING = 0.001
 """Added to every box that stands for a link's mesh, m (pybullet inflates hulls by as much)."""
+WAIST = 0.045
+"""Where the hand is cut into two boxes, from its origin along its z, m."""
 GRASPABLE_EDGE = 0.07
 """Longest footprint edge that the hand (opening 8 cm) takes with room to spare, m."""
 
@@ -54,7 +56,8 @@ class Panda:
     velocity: np.ndarray
     """(7,) rad/s."""
     arm: tuple[tuple[int, np.ndarray, np.ndarray], ...]
-    """Boxes around links: (index in LINKS, centre (3,), half extents (3,)) in that link's frame."""
+    """Boxes around links: (index in LINKS, centre (3,), half extents (3,)) in that link's frame;
+    the last two are the hand, which is narrower where the fingers are: that half comes first."""
     upper_arm: tuple[tuple[int, np.ndarray, np.ndarray], ...]
     """The same for UPPER_LINKS."""
     foot: tuple[np.ndarray, np.ndarray]
@@ -97,11 +100,12 @@ def panda() -> Panda:
     turn7 = _origin(joints["panda_hand"])[:3, :3]
     shift7 = np.array([0.0, 0.0, _numbers(joints["panda_link8"], "xyz")[2]])
     link7 = (_vertices(meshes / "link7.obj") - shift7) @ turn7
+    hand = _vertices(meshes / "hand.obj")
     arm = (
         (0, *_box(_vertices(meshes / "link5.obj"))),
         (1, *_box(_vertices(meshes / "link6.obj"))),
         (HAND, *_box(link7)),
-        (HAND, *_box(_vertices(meshes / "hand.obj"))),
+        *((HAND, *_halves(_slice(hand, *ends))) for ends in ((WAIST, np.inf), (-np.inf, WAIST))),
     )
     mount = _numbers(joints["panda_leftfinger"], "xyz")
     finger = _vertices(meshes / "finger.obj") + mount
@@ -122,7 +126,7 @@ def panda() -> Panda:
         foot=_box(_vertices(meshes / "link0.obj")),
         finger=(_slice(finger, middle, np.inf), _slice(finger, -np.inf, middle)),
         finger_tip=float(finger[:, 2].max()),
-        palm=float(_vertices(meshes / "hand.obj")[:, 2].max()),
+        palm=float(hand[:, 2].max()),
         max_opening=float(opening.get("upper", "nan")),
     )
 
@@ -159,8 +163,12 @@ def _vertices(path: Path) -> np.ndarray:
 
 
 def _box(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    low, high = vertices.min(0), vertices.max(0)
-    return (low + high) / 2, (high - low) / 2 + PADDING
+    return _halves((vertices.min(0) - PADDING, vertices.max(0) + PADDING))
+
+
+def _halves(corners: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    low, high = corners
+    return (low + high) / 2, (high - low) / 2
 
 
 def _slice(vertices: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numba import njit
 
-from relevance.planner.grasps import bodies
+from relevance.planner.grasps import Held, bodies
 from relevance.planner.kernels.kinematics import FRAME, look_at_frames
 from relevance.planner.kernels.motions import ALLOWED, dense_check
 from relevance.planner.path import Motion, put_down, upper_depth
@@ -90,8 +90,8 @@ def penetration(scene: Scene, result: PlanResult) -> float:
     return worst
 
 
-def _held(problem: Problem, name: str, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and half extents in the hand's frame of a box that the hand takes at q (7,), m."""
+def _held(problem: Problem, name: str, q: np.ndarray) -> Held:
+    """The box that the hand takes at q (7,)."""
     box = problem.boxes[name]
     look_at_frames(problem.arm, q)
     frame = problem.arm.frames_y[HAND * FRAME :]
@@ -99,4 +99,4 @@ def _held(problem: Problem, name: str, q: np.ndarray) -> tuple[np.ndarray, np.nd
     centre = R.T @ (np.array(box.position) - frame[:3])
     along = abs(math.cos(math.atan2(R[1, 1], R[0, 1]) - box.yaw)) > 0.5  # fingers along its x
     sizes = (box.size[1], box.size[0]) if along else box.size[:2]
-    return centre, np.array([*sizes, box.size[2]]) / 2
+    return Held(centre, np.array([*sizes, box.size[2]]) / 2, math.atan2(-R[2, 0], -R[2, 2]))

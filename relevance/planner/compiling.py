@@ -22,7 +22,7 @@ import numpy as np
 from numba.core import config
 
 from relevance.planner.grasps import bodies, grasps, pick_target
-from relevance.planner.kernels.kinematics import functions
+from relevance.planner.kernels.kinematics import TARGET, functions
 from relevance.planner.kernels.motions import ROWS, VERTICAL, motion, retreat
 from relevance.planner.keyframes import KeyframeBound
 from relevance.planner.pose import Placement, PoseBound
@@ -66,7 +66,7 @@ def first_half() -> None:
     grasp = grasps(problem.subject)[0]
     target, hand = pick_target(problem.subject, grasp), bodies(grasp.opening)
     rows = np.tile(HOME, (ROWS + 1, 1))
-    motion(rows, problem.arm, np.zeros(4), False, target, hand, problem.obstacles)
+    motion(rows, problem.arm, np.zeros(TARGET), False, target, hand, problem.obstacles)
     next(PoseBound(problem).place_all((problem.goal.subject,)), None)
 
 
@@ -75,7 +75,7 @@ def other_half() -> None:
     problem = _problem()
     grasp, place = grasps(problem.subject)[0], problem.reference.position
     rows = np.tile(HOME, (2 * VERTICAL + 1, 1))
-    retreat(rows, problem.arm, np.zeros(4), bodies(grasp.opening), problem.obstacles)
+    retreat(rows, problem.arm, np.zeros(TARGET), bodies(grasp.opening), problem.obstacles)
     there = Placement(grasp=grasp, pose=(*place[:2], 0.0))
     KeyframeBound(PoseBound(problem)).solve((problem.goal.subject,), [there])
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from relevance.planner.grasps import bodies, carried, hand_target, pick_target
+from relevance.planner.grasps import Grasp, bodies, carried, hand_target, pick_target
 from relevance.planner.kernels.boxes import (
     body_pose,
     dense_solve,
@@ -30,18 +30,21 @@ from relevance.planner.kernels.boxes import (
 )
 from relevance.planner.kernels.kinematics import (
     FRAME,
+    TARGET,
     Arm,
     hand_down,
     look_at_frames,
     look_at_grasp,
 )
+from relevance.planner.kernels.motions import reach_to
 from relevance.planner.kernels.rows import assign
 from relevance.planner.pose import Placement, PoseBound, moved_box
 from relevance.robot import ARM, HOME, panda
 from relevance.scene.geometry import UPRIGHT, upright
 
-CLEARANCE = 0.0025
-"""Clearance asked of every pair at a switch, m (the pose bound's MARGIN is larger)."""
+PICK_CLEARANCE, PLACE_CLEARANCE = 0.0008, 0.0025
+"""Clearance asked of every pair at a switch, m (the pose bound's PICK_MARGIN and MARGIN are
+larger)."""
 TOLERANCE = 2e-4
 """Largest violation (m, rad) of a solved problem."""
 STAY = (100.0, 1e5)
@@ -64,16 +67,17 @@ class Switches(NamedTuple):
     start: np.ndarray
     """(7,) configuration before the first switch, rad."""
     pick: np.ndarray
-    """(m, 4) hand target (x, y, z, finger angle) of each pick."""
+    """(m, TARGET) hand target of each pick."""
     place_z: np.ndarray
     """(m,) height of the hand at each place, m."""
     turn: np.ndarray
-    """(m, 3): angle of the finger axis minus the box's yaw, the placed box's height, and how far
-    the hand is shifted."""
+    """(m, 5): angle of the finger axis minus the box's yaw, the placed box's height, how far the
+    hand and its wrist are to the left of that axis, and how far the hand leans that way."""
     link: np.ndarray
     """(2m, B) bodies at each switch, as in `Bodies`; the first n_bodies[k] count."""
     centre: np.ndarray
     half: np.ndarray
+    lean: np.ndarray
     radius: np.ndarray
     n_bodies: np.ndarray
     obstacles: np.ndarray
@@ -87,8 +91,8 @@ class Switches(NamedTuple):
     region: np.ndarray
     """(5,) goal region of the last box's centre: x, y, angle, half extents."""
     bounds: np.ndarray
-    """(m, 4): of |x| and |y| of each placement, and of its distance from the base (near, far)
-    so that the hand can rise from it."""
+    """(m, 4): of |x| and |y| of each placement, and of the wrist's distance from the base (near,
+    far) so that the hand can rise from it."""
 
 
 class KeyframeBound:
@@ -120,8 +124,8 @@ class KeyframeBound:
         widest = len(arm.arm) + every * len(arm.upper_arm) + 2 * len(arm.finger) + 1
         link, n_bodies = np.zeros((2 * m, widest), np.int64), np.zeros(2 * m, np.int64)
         centre, half = np.zeros((2 * m, widest, 3)), np.zeros((2 * m, widest, 3))
-        radius = np.zeros((2 * m, widest))
-        pick, place_z, turn = np.zeros((m, 4)), np.zeros(m), np.zeros((m, 3))
+        lean, radius = np.zeros((2 * m, widest)), np.zeros((2 * m, widest))
+        pick, place_z, turn = np.zeros((m, TARGET)), np.zeros(m), np.zeros((m, 5))
         bounds = np.zeros((m, 4))
         x = np.zeros(17 * m)
         p0, weight = np.zeros(3 * m), np.zeros(3 * m)
@@ -136,9 +140,10 @@ class KeyframeBound:
             moved[problem.index[name]] = j
             pick[j] = pick_target(box, grasp)
             place_z[j] = bottom + box.size[2] / 2 + grasp.above
-            turn[j] = grasp.axis * math.pi / 2, bottom + box.size[2] / 2, grasp.shift
-            put = hand_target(*place.pose[:2], place_z[j], place.pose[2], grasp.shift)
-            way = _start(at, (pick[j], put), x[14 * j : 14 * j + 14], shifted=grasp.shift != 0)
+            turn[j, :2] = grasp.axis * math.pi / 2, bottom + box.size[2] / 2
+            turn[j, 2:] = grasp.shift, grasp.wrist[0], grasp.tilt
+            put = hand_target(*place.pose[:2], place_z[j], place.pose[2], grasp)
+            way = _start(at, (pick[j], put), x[14 * j : 14 * j + 14], grasp)
             if way == 0:
                 return None
             p0[3 * j : 3 * j + 3] = place.pose
@@ -146,7 +151,9 @@ class KeyframeBound:
                 held = carried(box, grasp, way) if k % 2 else None
                 body = bodies(grasp.opening, held, upper=every)
                 n_bodies[k] = count = len(body.link)
-                link[k, :count], centre[k, :count], half[k, :count], radius[k, :count] = body
+                rows = link, centre, half, lean, radius
+                for row, value in zip(rows, body, strict=True):
+                    row[k, :count] = value
                 stands[k, problem.index[name]] = False
             c, s = abs(math.cos(place.pose[2])), abs(math.sin(place.pose[2]))
             along, across = grasp.parts[0, 2], grasp.parts[0, 3]
@@ -155,7 +162,7 @@ class KeyframeBound:
             bounds[j, 2:] = self.pose.interval(bottom, box, grasp)
         x[14 * m :] = p0
         switches = Switches(
-            HOME, pick, place_z, turn, link, centre, half, radius, n_bodies, obstacles,
+            HOME, pick, place_z, turn, link, centre, half, lean, radius, n_bodies, obstacles,
             stands, moved, supports, problem.goal_region(reference, *p0[-3:-1]), bounds,
         )  # fmt: skip
         start, elbow = x.copy(), x[2 : 14 * m : ARM]
@@ -171,19 +178,31 @@ class KeyframeBound:
         return None
 
 
-def _start(arm: Arm, targets: tuple[np.ndarray, ...], q: np.ndarray, *, shifted: bool) -> float:
+def _start(arm: Arm, targets: tuple[np.ndarray, ...], q: np.ndarray, grasp: Grasp) -> float:
     """Fill q (14,) with configurations for the pick and the place of one box.
 
-    Returns which way round the hand is (1, -1), 0 where it does not reach both: a shifted hand
+    Returns which way round the hand is (1, -1), 0 where it does not reach both: a lopsided hold
     must be the same way round at both, any other is symmetric.
     """
-    for way in (1.0, -1.0) if shifted else (0.0,):
+    for way in (1.0, -1.0) if grasp.lopsided else (0.0,):
         if all(
-            hand_down(target, arm.base, arm.lower, arm.upper, q[k * ARM : (k + 1) * ARM], way)
+            _reach(arm, target, q[k * ARM : (k + 1) * ARM], grasp, way)
             for k, target in enumerate(targets)
         ):
             return way or 1.0
     return 0.0
+
+
+def _reach(arm: Arm, target: np.ndarray, q: np.ndarray, grasp: Grasp, way: float) -> bool:
+    """Fill q (7,) for a hand target: in closed form, from there on by iteration if it leans."""
+    upright = target.copy()
+    if grasp.tilt:
+        left, rise = grasp.wrist[0] - grasp.shift, grasp.wrist[1] - grasp.above
+        upright[0] -= left * math.sin(target[3])
+        upright[1] += left * math.cos(target[3])
+        upright[2] += rise
+    there = hand_down(upright, arm.base, arm.lower, arm.upper, q, way)
+    return there and (not grasp.tilt or reach_to(arm, q, target))
 
 
 @njit(cache=True)
@@ -219,7 +238,7 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
     index = np.zeros(16, np.int64)
     row, part = np.zeros(16), np.zeros(ARM)
     p, R, normal, contact = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
-    there, target = np.zeros((len(obstacles), UPRIGHT)), np.zeros(4)
+    there, target = np.zeros((len(obstacles), UPRIGHT)), np.zeros(TARGET)
     for k in range(2 * m):
         for i in range(ARM):
             a = k * ARM + i
@@ -245,9 +264,11 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
             c, s = math.cos(x[at + 2]), math.sin(x[at + 2])
             target[0], target[1] = x[at] - shift * s, x[at + 1] + shift * c
             target[2], target[3] = switches.place_z[j], x[at + 2]
+            target[4] = switches.turn[j, 4]
         else:
             assign(target, switches.pick[j])
         q = x[k * ARM : (k + 1) * ARM]
+        clearance = PLACE_CLEARANCE if placing else PICK_CLEARANCE
         look_at_grasp(arm, q, target)
         look_at_frames(arm, q)
         for r in range(6):
@@ -287,7 +308,7 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
         for b in range(switches.n_bodies[k]):
             link = switches.link[k, b] * FRAME
             frame = arm.frames_y[link : link + FRAME]
-            body_pose(frame, switches.centre[k, b], p, R)
+            body_pose(frame, switches.centre[k, b], switches.lean[k, b], p, R)
             for w in range(len(obstacles)):
                 held = b == switches.n_bodies[k] - 1
                 if not switches.stands[k, w]:
@@ -297,10 +318,10 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                     under = switches.turn[j, 1] - switches.half[k, b, 2]
                     if w == switches.support[j] or o[2] + o[6] <= under + 1e-6:
                         continue
-                if ineq[k, b, w] == 0.0 and not near(p, switches.radius[k, b] + CLEARANCE, o):
+                if ineq[k, b, w] == 0.0 and not near(p, switches.radius[k, b] + clearance, o):
                     continue
                 d = separation(p, R, switches.half[k, b], o, normal, contact)
-                value = CLEARANCE - d
+                value = clearance - d
                 ineq[k, b, w] = max(0.0, ineq[k, b, w] + gain * value)
                 if value + ineq[k, b, w] / mu <= 0:
                     continue
@@ -319,19 +340,22 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                 worst = max(worst, violated)
     for j in range(m):
         at = first + 3 * j
-        ox, oy = x[at] - arm.base[0], x[at + 1] - arm.base[1]
+        c, s = math.cos(x[at + 2]), math.sin(x[at + 2])
+        left = switches.turn[j, 3]
+        ox, oy = x[at] - left * s - arm.base[0], x[at + 1] + left * c - arm.base[1]
         distance = max(math.sqrt(ox * ox + oy * oy), 1e-6)
         for side in range(10):
             # 0..3: the goal region of the last placement; 4..7: the table's edge; 8, 9: reach
             if side < 4 and j < m - 1:
                 continue
             sign = 1.0 if side % 2 == 0 else -1.0
+            row[2] = 0.0
             if side < 4:
-                c, s = math.cos(region[2]), math.sin(region[2])
+                cr, sr = math.cos(region[2]), math.sin(region[2])
                 if side < 2:
-                    row[0], row[1] = sign * c, sign * s
+                    row[0], row[1] = sign * cr, sign * sr
                 else:
-                    row[0], row[1] = -sign * s, sign * c
+                    row[0], row[1] = -sign * sr, sign * cr
                 bound = region[3] if side < 2 else region[4]
                 value = row[0] * (x[at] - region[0]) + row[1] * (x[at + 1] - region[1]) - bound
             elif side < 8:
@@ -340,10 +364,11 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                 value = row[0] * x[at] + row[1] * x[at + 1] - bound
             else:
                 row[0], row[1] = sign * ox / distance, sign * oy / distance
+                row[2] = -left * (c * row[0] + s * row[1])
                 value = sign * (distance - switches.bounds[j, 3 if side == 8 else 2])
-            index[0], index[1] = at, at + 1
+            index[0], index[1], index[2] = at, at + 1, at + 2
             edge[j, side] = max(0.0, edge[j, side] + gain * value)
-            got, violated = _push(H, g, index, row, np.int64(2), value, edge[j, side], mu, 0.0)
+            got, violated = _push(H, g, index, row, np.int64(3), value, edge[j, side], mu, 0.0)
             merit += got
             worst = max(worst, violated)
     for i in range(n):

@@ -9,8 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from relevance.planner.grasps import bodies, carried, hand_target, pick_target, upper_bodies
-from relevance.planner.kernels.kinematics import finger_turn, finger_way
+from relevance.planner.grasps import (
+    Held,
+    bodies,
+    carried,
+    hand_target,
+    pick_target,
+    upper_bodies,
+)
+from relevance.planner.kernels.kinematics import TARGET, finger_turn, finger_way
 from relevance.planner.kernels.motions import (
     ALLOWED,
     ROWS,
@@ -52,8 +59,7 @@ class _Leg(NamedTuple):
     leaving: bool
     arrive: np.ndarray
     opening: float
-    held: tuple[np.ndarray, np.ndarray] | None
-    """The box in the hand (`carried`)."""
+    held: Held | None
     obstacles: np.ndarray
 
 
@@ -91,7 +97,7 @@ class PathBound:
         legs: list[_Leg] = []
         releases: list[tuple[np.ndarray, tuple[float, float, float]]] = []
         final: dict[str, Pose] = {}
-        at, leave, leaving = HOME, np.zeros(4), False
+        at, leave, leaving = HOME, np.zeros(TARGET), False
         for j, (name, place) in enumerate(zip(order, placements, strict=True)):
             box, grasp, i = problem.boxes[name], place.grasp, problem.index[name]
             last = name == problem.goal.subject
@@ -101,7 +107,7 @@ class PathBound:
                 bottom = obstacles[problem.index[on], 2] + obstacles[problem.index[on], 6]
             take = pick_target(box, grasp)
             z = bottom + box.size[2] / 2 + grasp.above
-            put = hand_target(poses[j, 0], poses[j, 1], z, poses[j, 2], grasp.shift)
+            put = hand_target(poses[j, 0], poses[j, 1], z, poses[j, 2], grasp)
             in_hand = carried(box, grasp, finger_way(arm, q[2 * j], take[3]))
             for k, (arrive, held, opening) in enumerate(
                 ((take, None, grasp.opening), (put, in_hand, grasp.closed))

@@ -1,18 +1,25 @@
 """Pose bound: can the hand take this box, and can the box stand there?
 
-All of it in the plane (`kernels.planar`): the hand comes straight down.
+All of it in the plane (`kernels.planar`): the hand, leaning or not, comes straight down.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress, islice
+from typing import NamedTuple
 
 import numpy as np
 
-from relevance.planner.grasps import Family, Grasp, deep_grasps, other_grasps, pick_target
+from relevance.planner.grasps import (
+    Family,
+    Grasp,
+    deep_grasps,
+    leaning_grasps,
+    other_grasps,
+)
 from relevance.planner.kernels.kinematics import facing, reach_interval
 from relevance.planner.kernels.planar import (
     ANY_TURN,
@@ -38,6 +45,8 @@ REACH_MARGIN = 0.004
 """Distance kept from the ends of the arm's reach, m."""
 REFERENCE_PLACES = ((0.0, 0.0), (-0.1, 0.25), (-0.1, -0.25), (0.1, 0.15), (0.1, -0.15))
 """Where to look for room for a reference that is moved (x, y), m."""
+FAMILIES = (deep_grasps, other_grasps, leaning_grasps)
+"""The grasps of a box, the preferred first."""
 SKY = 2.0
 """Height up to which the hand and what is above it count as an obstacle, m."""
 
@@ -51,69 +60,74 @@ class Placement:
     """x, y, angle of the finger axis."""
 
 
+class _Blocked(NamedTuple):
+    """Who must have left before an object can be taken with each grasp of a family."""
+
+    family: Family
+    who: list[frozenset[str] | None]
+    """None: out of reach."""
+    sets: frozenset[frozenset[str]]
+
+    def free(self, gone: frozenset[str]) -> tuple[Grasp, ...]:
+        """The grasps that are free once these have left."""
+        numbers = enumerate(self.who)
+        return tuple(self.family[g] for g, who in numbers if who is not None and who <= gone)
+
+
 class PoseBound:
     """Who is in the way of whom, and where boxes may stand; remembers what it was asked."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        self._blockers: dict[str, dict[Grasp, frozenset[str]]] = {}
-        self._more: dict[str, dict[Grasp, frozenset[str]]] = {}
-        self._close: dict[str, tuple[list[frozenset[str]], list[frozenset[str]]]] = {}
+        self._blocked: dict[tuple[str, Callable[[Box], Family]], _Blocked] = {}
+        self._close: dict[str, tuple[set[frozenset[str]], set[frozenset[str]]]] = {}
         """For objects about whose pick less than CLOSE may decide: who is in the way of each grasp
         with that much more room asked for, and less."""
         self._goal_poses: dict[tuple, Placement | None] = {}
         self._held: dict[tuple[tuple[Grasp, ...], float], tuple] = {}
         self._intervals: dict[float, tuple[float, float]] = {}
-
-    def blockers(self, name: str) -> dict[Grasp, frozenset[str]]:
-        """The deep, centred grasps of an object, and who must have left before it can be picked
-        that way."""
-        if name not in self._blockers:
-            self._blockers[name] = self._blocked(name, deep_grasps(self.problem.boxes[name]))
-        return self._blockers[name]
-
-    def more_blockers(self, name: str) -> dict[Grasp, frozenset[str]]:
-        """The same for the other grasps: each shift from deep to shallow."""
-        if name not in self._more:
-            self._more[name] = self._blocked(name, other_grasps(self.problem.boxes[name]))
-        return self._more[name]
+        self._facings: dict[tuple[Grasp, int], tuple[float, float]] = {}
+        self._rooms: dict[tuple, bool] = {}
 
     def in_the_way(self, name: str) -> frozenset[str]:
         """Whoever blocks a pick of the object by some grasp, or stands on it."""
-        sets = (*self.blockers(name).values(), *self.more_blockers(name).values())
-        return self.problem.above[name].union(*sets)
+        blocked = (self._blockers(name, family) for family in FAMILIES)
+        return self.problem.above[name].union(*(who for some in blocked for who in some.sets))
 
     def grasps(self, name: str) -> tuple[Grasp, ...]:
-        """The grasps with which an object can be reached where it stands at first."""
-        return tuple(self.blockers(name)) or tuple(self.more_blockers(name))
+        """The preferred grasps with which an object can be reached where it stands at first."""
+        everything = frozenset(self.problem.boxes)
+        blocked = (self._blockers(name, family) for family in FAMILIES)
+        return next((some.free(everything) for some in blocked if some.sets), ())
 
     def pickable(self, name: str, gone: frozenset[str]) -> bool:
         """Whether the object can be taken once the objects in `gone` have left."""
-        found = bool(self._deep(name, gone) or self._others(name, gone))
-        if name in self._close and self.problem.above[name] <= gone:
-            self.more_blockers(name)
+        self.problem.counts.pose += 1
+        if not self.problem.above[name] <= gone:
+            return False
+        found = any(
+            any(who <= gone for who in self._blockers(name, family).sets) for family in FAMILIES
+        )
+        if name in self._close:
+            for family in FAMILIES:
+                self._blockers(name, family)
             surely, perhaps = (any(who <= gone for who in sets) for sets in self._close[name])
             self.problem.undecided |= surely != perhaps
         return found
 
-    def _deep(self, name: str, gone: frozenset[str]) -> tuple[Grasp, ...]:
-        self.problem.counts.pose += 1
-        if not self.problem.above[name] <= gone:
-            return ()
-        return tuple(grasp for grasp, who in self.blockers(name).items() if who <= gone)
-
-    def _others(self, name: str, gone: frozenset[str]) -> tuple[Grasp, ...]:
-        if not self.problem.above[name] <= gone:
-            return ()
-        return tuple(grasp for grasp, who in self.more_blockers(name).items() if who <= gone)
-
     def choices(self, name: str, gone: frozenset[str]) -> Iterator[tuple[Grasp, ...]]:
         """Ways to take an object, the best first: one deep grasp each, then all others across one
-        edge."""
-        yield from ((grasp,) for grasp in self._deep(name, gone))
-        others = self._others(name, gone)
-        for axis in dict.fromkeys(grasp.axis for grasp in others):
-            yield tuple(grasp for grasp in others if grasp.axis == axis)
+        edge, then all that lean."""
+        self.problem.counts.pose += 1
+        if not self.problem.above[name] <= gone:
+            return
+        for family in FAMILIES:
+            free = self._blockers(name, family).free(gone)
+            if family is deep_grasps:
+                yield from ((grasp,) for grasp in free)
+                continue
+            for axis in dict.fromkeys(grasp.axis for grasp in free):
+                yield tuple(grasp for grasp in free if grasp.axis == axis)
 
     def goal_poses(
         self, gone: frozenset[str], reference: Box, *, everywhere: bool = False
@@ -125,6 +139,7 @@ class PoseBound:
         """
         problem = self.problem
         subject = problem.subject
+        deep = set(deep_grasps(subject))
         standing: np.ndarray | None = None
         taken = frozenset(problem.boxes) if everywhere else gone
         choices = self.choices(subject.name, taken)
@@ -136,7 +151,10 @@ class PoseBound:
                 if standing is None:
                     standing = problem.standing(gone | {subject.name, reference.name})
                     standing = np.vstack([standing, obstacle(reference)])
-                found = self._find(area, area[:2], bottom, subject, choice, standing)
+                where = area, bottom, subject, standing
+                found = None
+                if choice[0] in deep or self._roomy((gone, *key[2:]), *where):
+                    found = self._find(area, area[:2], bottom, subject, choice, standing)
                 self._goal_poses[key] = found
             found = self._goal_poses[key]
             if found is not None:
@@ -157,7 +175,7 @@ class PoseBound:
                 found = self._place_blockers(order, kept, reference)
                 if found is not None:
                     yield [*found, place]
-                    if place.grasp.shift:
+                    if place.grasp.lopsided:
                         yield from ([*found, twin] for twin in self._twins(gone, place))
 
     def _twins(self, gone: frozenset[str], place: Placement) -> Iterator[Placement]:
@@ -165,58 +183,77 @@ class PoseBound:
         the same place, but the other way round."""
         x, y, angle = place.pose
         grasp = place.grasp
-        for other in self._others(self.problem.goal.subject, gone):
+        family = leaning_grasps if grasp.tilt else other_grasps
+        for other in self._blockers(self.problem.goal.subject, family).free(gone):
             same = other.axis == grasp.axis and other.depth == grasp.depth
-            if same and other.shift == -grasp.shift:
+            if same and _side(other) == _side(grasp, 1):
                 yield Placement(grasp=other, pose=(x, y, angle + math.pi))
 
     def interval(self, bottom: float, box: Box, grasp: Grasp) -> tuple[float, float]:
-        """Reach (near, far) for holding the box with its underside at this height, liftably, m."""
-        # Heights in whole millimetres, to compute each once; REACH_MARGIN covers the rest.
-        z = round(bottom + box.size[2] / 2 + grasp.above - self.problem.scene.robot.base[2], 3)
-        if z not in self._intervals:
+        """Reach (near, far) of the wrist that holds the box with its underside at this height,
+        liftably, m."""
+        return self._interval(bottom + box.size[2] / 2 + grasp.wrist[1])
+
+    def _interval(self, height: float) -> tuple[float, float]:
+        if height not in self._intervals:
+            # In whole millimetres, to compute each once; REACH_MARGIN covers the rest.
+            z = round(height - self.problem.scene.robot.base[2], 3)
             near, far = reach_interval(z)
             near_up, far_up = reach_interval(round(z + LIFT, 3))
             reach = max(near, near_up) + REACH_MARGIN, min(far, far_up) - REACH_MARGIN
-            self._intervals[z] = reach
-        return self._intervals[z]
+            self._intervals[height] = reach
+        return self._intervals[height]
 
-    def _blocked(self, name: str, family: Family) -> dict[Grasp, frozenset[str]]:
-        problem, found = self.problem, {}
+    def _blockers(self, name: str, family: Callable[[Box], Family]) -> _Blocked:
+        """Who blocks a pick of the object with each grasp of one of its FAMILIES."""
+        if (name, family) not in self._blocked:
+            self._blocked[name, family] = self._measure(name, family(self.problem.boxes[name]))
+        return self._blocked[name, family]
+
+    def _measure(self, name: str, family: Family) -> _Blocked:
+        problem = self.problem
         problem.counts.pose += 1
-        i, box, count = problem.index[name], problem.boxes[name], len(problem.boxes)
-        x, y, _ = problem.scene.robot.base
-        r = math.hypot(box.position[0] - x, box.position[1] - y)
-        reached: dict[float, bool] = {}  # by the height of the hand
-        for grasp in family.grasps:
-            if grasp.above not in reached:
-                near, far = self.interval(box.bottom, box, grasp)
-                problem.undecided |= min(abs(r - near), abs(r - far)) < CLOSE
-                reached[grasp.above] = near <= r <= far
-        if any(reached.values()):
-            blocking = np.zeros((len(family.grasps), count), np.bool_)
-            boxes = problem.obstacles[:count]
-            names, seen = list(problem.boxes), {}
+        i, count = problem.index[name], len(problem.boxes)
+        reached = self._reached(problem.boxes[name], family)
+        if not any(reached):
+            return _Blocked(family, [None] * len(family), frozenset())
+        blocking = np.zeros((len(family), count), np.bool_)
+        boxes, names, seen = problem.obstacles[:count], list(problem.boxes), {}
 
-            def blockers(room: float) -> tuple[list[frozenset[str]], float]:
-                close = pick_blockers(i, family.axes, family.parts, boxes, room, blocking)
-                sets = []
-                for g, grasp in enumerate(family.grasps):
-                    if reached[grasp.above]:
-                        bits = blocking[g].tobytes()
-                        if bits not in seen:
-                            seen[bits] = frozenset(compress(names, blocking[g].tolist()))
-                        sets.append(seen[bits])
-                return sets, close
+        def blockers(room: float) -> tuple[list[frozenset[str] | None], float]:
+            close = pick_blockers(i, family.axes, family.parts, boxes, room, blocking)
+            who = list[frozenset[str] | None]()
+            for g, within in enumerate(reached):
+                bits = blocking[g].tobytes()
+                if within and bits not in seen:
+                    seen[bits] = frozenset(compress(names, blocking[g].tolist()))
+                who.append(seen[bits] if within else None)
+            return who, close
 
-            sets, close = blockers(PICK_MARGIN)
-            found = dict(zip((g for g in family.grasps if reached[g.above]), sets, strict=True))
-            if close < CLOSE or name in self._close:
-                before = list(self._blockers.get(name, {}).values())
-                more, less = self._close.setdefault(name, (before, list(before)))
-                more += blockers(PICK_MARGIN + CLOSE)[0]
-                less += blockers(PICK_MARGIN - CLOSE)[0]
-        return found
+        who, close = blockers(PICK_MARGIN)
+        sets = frozenset(one for one in who if one is not None)
+        if close < CLOSE or name in self._close:
+            before = set[frozenset[str]]().union(
+                *(some.sets for (other, _), some in self._blocked.items() if other == name)
+            )
+            more, less = self._close.setdefault(name, (before, set(before)))
+            more.update(one for one in blockers(PICK_MARGIN + CLOSE)[0] if one is not None)
+            less.update(one for one in blockers(PICK_MARGIN - CLOSE)[0] if one is not None)
+        return _Blocked(family, who, sets)
+
+    def _reached(self, box: Box, family: Family) -> list[bool]:
+        """Which grasps are within reach where the box stands."""
+        if not len(family):
+            return []
+        x, y, _ = self.problem.scene.robot.base
+        angles, left = box.yaw + family.axes * (math.pi / 2), family.wrists[:, 0]
+        r = np.hypot(
+            box.position[0] - x - left * np.sin(angles), box.position[1] - y + left * np.cos(angles)
+        )
+        heights = (box.bottom + box.size[2] / 2 + family.wrists[:, 1]).tolist()
+        near, far = np.array([self._interval(height) for height in heights]).T
+        self.problem.undecided |= bool(np.minimum(abs(r - near), abs(r - far)).min() < CLOSE)
+        return ((near <= r) & (r <= far)).tolist()
 
     def _find(
         self,
@@ -229,8 +266,8 @@ class PoseBound:
     ) -> Placement | None:
         """How the box can be put down in an area (5,), clear of obstacles (W, UPRIGHT).
 
-        choice: grasps across one edge. Of those with equal shift the shallowest, which is in
-        nobody's way when a deeper one is not, decides; the deepest that is as free is taken.
+        choice: grasps across one edge. Of those with equal shift and tilt the shallowest, which is
+        in nobody's way when a deeper one is not, decides; the deepest that is as free is taken.
         bottom: height of what it is put on, m.
         """
         problem = self.problem
@@ -252,7 +289,7 @@ class PoseBound:
             x, y, angle, way = pose.tolist()
             grasp, turn = ways[int(way)]
             for deeper in choice:
-                if deeper.shift == grasp.shift and deeper.depth > grasp.depth:
+                if _side(deeper) == _side(grasp) and deeper.depth > grasp.depth:
                     held, there = self._held_so([(deeper, turn)], box, bottom)
                     value, _ = slack(x, y, angle, bottom, held, obstacles, table, at, there, 0.0)
                     if value >= 0:
@@ -268,17 +305,33 @@ class PoseBound:
         problem.undecided |= close
         return found
 
-    def _ways(self, choice: tuple[Grasp, ...], box: Box) -> list[tuple[Grasp, int]]:
-        """The shallowest grasp of each shift, and whether the hand is turned by half a turn.
+    def _roomy(
+        self, key: tuple, area: np.ndarray, bottom: float, box: Box, obstacles: np.ndarray
+    ) -> bool:
+        """Whether there is room for the box alone: where there is none, no hold helps."""
+        if key not in self._rooms:
+            self.problem.counts.pose += 1
+            alone = np.array([[[0.0, 0.0, box.size[0] / 2, box.size[1] / 2, 0.0]]])
+            reach = np.array([[0.0, 0.0, SKY, 0.0, ANY_TURN]])
+            table, at, pose = self.problem.table, self.problem.arm.base, np.zeros(4)
+            status, _ = find_pose(
+                area, area[:2], bottom, alone, obstacles, table, at, reach, CLOSE, pose
+            )
+            self._rooms[key] = status != NONE
+        return self._rooms[key]
 
-        Shifted to one side, or to the other and turned, the hand is at the same place: the second
-        counts where the first may not point everywhere.
+    def _ways(self, choice: tuple[Grasp, ...], box: Box) -> list[tuple[Grasp, int]]:
+        """The shallowest grasp of each shift and tilt, and whether the hand is turned by half a
+        turn.
+
+        To one side, or to the other and turned, the hand is at the same place: the second counts
+        where the first may not point everywhere.
         """
-        shallow = {grasp.shift: grasp for grasp in choice}.values()
+        shallow = {_side(grasp): grasp for grasp in choice}.values()
         sides = [
-            (grasp.price, -grasp.shift if turn else grasp.shift, turn, grasp)
+            (grasp.price, _side(grasp, turn), turn, grasp)
             for grasp in shallow
-            for turn in ((0, 1) if grasp.shift else (0,))
+            for turn in ((0, 1) if grasp.lopsided else (0,))
         ]
         found, settled = [], set()
         for _, side, turn, grasp in sorted(sides, key=lambda one: one[:3]):
@@ -295,7 +348,11 @@ class PoseBound:
         parts = np.array([_turned(one.parts) if turn else one.parts for one, turn in ways])
         reach = np.array(
             [
-                (*self.interval(bottom, box, one), *self._facing(box, one, turn))
+                (
+                    -one.wrist[0] if turn else one.wrist[0],
+                    *self.interval(bottom, box, one),
+                    *self._facing(box, one, turn),
+                )
                 for one, turn in ways
             ]
         )
@@ -305,12 +362,18 @@ class PoseBound:
         """Where the finger axis may point at the place, against its bearing from the robot: middle
         and half width, rad.
 
-        A shifted hand is the same way round at pick and place, and its last joint has limits.
+        A lopsided hold is the same way round at pick and place, and the last joint has limits.
         """
-        if grasp.shift == 0.0:
+        if not grasp.lopsided:
             return 0.0, ANY_TURN
-        x, y, _, angle = pick_target(box, grasp).tolist()
+        if (grasp, turn) not in self._facings:
+            self._facings[grasp, turn] = self._turns(box, grasp, turn)
+        return self._facings[grasp, turn]
+
+    def _turns(self, box: Box, grasp: Grasp, turn: int) -> tuple[float, float]:
         base, limit = self.problem.arm.base, float(self.problem.arm.upper[-1])
+        angle, left = box.yaw + grasp.axis * math.pi / 2, grasp.wrist[0]
+        x, y = box.position[0] - left * math.sin(angle), box.position[1] + left * math.cos(angle)
         seen = angle - math.atan2(y - base[1], x - base[0])
         ways = [way for way in (1.0, -1.0) if abs(_wrapped(seen - facing(way))) <= limit]
         if len(ways) != 1:
@@ -398,8 +461,13 @@ def moved_box(box: Box, place: Placement) -> Box:
     return replace(box, position=(x, y, box.size[2] / 2), yaw=yaw, on=None)
 
 
+def _side(grasp: Grasp, turn: int = 0) -> tuple[float, float]:
+    """To which side of the box the hand is; turn: after half a turn."""
+    return (-grasp.shift, -grasp.tilt) if turn else (grasp.shift, grasp.tilt)
+
+
 def _turned(parts: np.ndarray) -> np.ndarray:
-    """The parts of a grasp (5, 5) turned by half a turn about the box."""
+    """The parts of a grasp (P, 5) turned by half a turn about the box."""
     turned = parts.copy()
     turned[:, 1] *= -1  # along the finger axis they come in pairs
     return turned

@@ -401,7 +401,7 @@ class _Search:
         rank = {name: i for i, name in enumerate(movable) if name != subject}
         frontier, rest = [frozenset[str]()], list[frozenset[str]]()
         for level in range(self.config.max_actions // 2):
-            found, following, others = [], set(), set()
+            found, tried = [], list[tuple[frozenset[str], bool]]()
             if level == LOOK:
                 leaving = frozenset(self._leaving(list(rank)))
                 if not (required or self._works(leaving)):
@@ -418,12 +418,15 @@ class _Search:
                         found.append(motion)
                         if self.config.stop == "first":
                             return found
-                helpful = near | self._in_the_way(chosen)
-                following |= {chosen | {name} for name in helpful - chosen if name in rank}
-                if self.late:  # the others' leaving can make room for what is put aside
-                    others |= {chosen | {name} for name in rank if name not in chosen}
+                tried.append((chosen, self.late))
             if found:
                 return found
+            following, others = set(), set()
+            for chosen, late in tried:
+                helpful = near | self._in_the_way(chosen)
+                following |= {chosen | {name} for name in helpful - chosen if name in rank}
+                if late:  # the others' leaving can make room for what is put aside
+                    others |= {chosen | {name} for name in rank if name not in chosen}
             frontier = sorted(following, key=partial(_ranks, rank))
             rest = sorted(others - following, key=partial(_ranks, rank))
         self.cut |= bool(frontier or rest)

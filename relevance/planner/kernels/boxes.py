@@ -2,8 +2,9 @@
 
 An obstacle is a row of UPRIGHT numbers (`relevance.scene.geometry`).
 
-`separation` looks along the six face normals only. That is exact for two upright boxes and
-never above the true distance otherwise, so a margin kept here is a margin kept.
+`separation` looks along the six face normals, which is exact for two upright boxes, and where
+that leaves less than NEAR along what is normal to two edges, too. It is never above the true
+distance, so a margin kept here is a margin kept.
 """
 
 from __future__ import annotations
@@ -15,8 +16,12 @@ import numpy as np
 from numba import njit
 
 
+NEAR = 0.003
+"""More than what any bound asks two boxes to be apart, m."""
+
+
 class Bodies(NamedTuple):
-    """Boxes that move with the arm during one motion, each aligned with its link's axes."""
+    """Boxes that move with the arm during one motion."""
 
     link: np.ndarray
     """(B,) index in LINKS."""
@@ -24,6 +29,8 @@ class Bodies(NamedTuple):
     """(B, 3) in the link's frame, m."""
     half: np.ndarray
     """(B, 3) m."""
+    turn: np.ndarray
+    """(B,) about the link's y, of the body's axes against the link's, rad."""
     radius: np.ndarray
     """(B,) of the sphere around each, m."""
 
@@ -93,16 +100,81 @@ def separation(p, R, h, obstacle, n, x):
         x[0] -= side * s
         x[1] += side * c
         x[2] += obstacle[6] if n[2] > 1e-9 else (-obstacle[6] if n[2] < -1e-9 else 0.0)
+    return best if best > NEAR else _between_edges(p, R, h, obstacle, best, n, x)
+
+
+@njit(cache=True)
+def _between_edges(p, R, h, obstacle, best, n, x):
+    """The same as `separation`, where two edges are farther apart than the faces (best, m) are."""
+    dx, dy, dz = p[0] - obstacle[0], p[1] - obstacle[1], p[2] - obstacle[2]
+    c, s = obstacle[8], obstacle[9]
+    which, nx, ny, nz = -1, 0.0, 0.0, 0.0
+    for i in range(3):
+        ex = c if i == 0 else (-s if i == 1 else 0.0)
+        ey = s if i == 0 else (c if i == 1 else 0.0)
+        ez = 1.0 if i == 2 else 0.0
+        for k in range(3):
+            ax = ey * R[2, k] - ez * R[1, k]
+            ay = ez * R[0, k] - ex * R[2, k]
+            az = ex * R[1, k] - ey * R[0, k]
+            size = math.sqrt(ax * ax + ay * ay + az * az)
+            if size < 0.05:  # as good as parallel: the faces say it
+                continue
+            ax, ay, az = ax / size, ay / size, az / size
+            reach = (
+                obstacle[4] * abs(ax * c + ay * s)
+                + obstacle[5] * abs(ay * c - ax * s)
+                + obstacle[6] * abs(az)
+            )
+            for j in range(3):
+                reach += h[j] * abs(ax * R[0, j] + ay * R[1, j] + az * R[2, j])
+            d = abs(ax * dx + ay * dy + az * dz) - reach
+            if d > best + 1e-9:
+                best, which, nx, ny, nz = d, 3 * i + k, ax, ay, az
+    if which < 0:
+        return best
+    if nx * dx + ny * dy + nz * dz < 0:
+        nx, ny, nz = -nx, -ny, -nz
+    n[0], n[1], n[2] = nx, ny, nz
+    i, k = which // 3, which % 3
+    # The middles of both edges, then the point of the box's edge that is nearest to the other.
+    qx, qy, qz = obstacle[0], obstacle[1], obstacle[2]
+    x[0], x[1], x[2] = p[0], p[1], p[2]
+    for j in range(3):
+        ex = c if j == 0 else (-s if j == 1 else 0.0)
+        ey = s if j == 0 else (c if j == 1 else 0.0)
+        ez = 1.0 if j == 2 else 0.0
+        if j != i:
+            side = math.copysign(obstacle[4 + j], nx * ex + ny * ey + nz * ez)
+            qx, qy, qz = qx + side * ex, qy + side * ey, qz + side * ez
+        if j != k:
+            side = -math.copysign(h[j], nx * R[0, j] + ny * R[1, j] + nz * R[2, j])
+            for a in range(3):
+                x[a] += side * R[a, j]
+    ex = c if i == 0 else (-s if i == 1 else 0.0)
+    ey = s if i == 0 else (c if i == 1 else 0.0)
+    ez = 1.0 if i == 2 else 0.0
+    rx, ry, rz = x[0] - qx, x[1] - qy, x[2] - qz
+    b = ex * R[0, k] + ey * R[1, k] + ez * R[2, k]
+    along = b * (ex * rx + ey * ry + ez * rz) - (R[0, k] * rx + R[1, k] * ry + R[2, k] * rz)
+    along = min(max(along / (1 - b * b), -h[k]), h[k])
+    for a in range(3):
+        x[a] += along * R[a, k]
     return best
 
 
 @njit(cache=True)
-def body_pose(frame, centre, p, R):
+def body_pose(frame, centre, turn, p, R):
     """World centre p (3,) and axes R (3, 3) of a body, from its link's frame (FRAME,)."""
     for i in range(3):
         for j in range(3):
             R[i, j] = frame[3 + 3 * i + j]
         p[i] = frame[i] + R[i, 0] * centre[0] + R[i, 1] * centre[1] + R[i, 2] * centre[2]
+    if turn != 0.0:
+        c, s = math.cos(turn), math.sin(turn)
+        for i in range(3):
+            x, z = R[i, 0], R[i, 2]
+            R[i, 0], R[i, 2] = c * x - s * z, s * x + c * z
 
 
 @njit(cache=True)

@@ -17,6 +17,9 @@ from numba import njit
 from relevance.planner.kernels.native import Native, call, load
 from relevance.robot import ARM, HAND, LINKS, UPPER_LINKS, panda
 
+TARGET = 5
+"""Numbers of a hand target: x, y, z of its origin (m), the finger axis' angle, and how far the hand
+leans to the left of that axis (rad): 0 where it points straight down."""
 FRAME = 54
 """Numbers a frame takes in the output of `frames`: p (3), R (9), Jv (21), Jw (21), row-major."""
 LIMIT_MARGIN = 1e-3
@@ -31,7 +34,7 @@ class Functions(NamedTuple):
     all_frames: Native
     """The same for LINKS and UPPER_LINKS."""
     grasp: Native
-    """x = (q (7), base (4), target (4)); y = residual (6), d/dq (6 x 7), d/dtarget (6 x 4)."""
+    """x = (q (7), base (4), target (5)); y = residual (6), d/dq (6 x 7), d/dtarget[:4] (6 x 4)."""
 
 
 class Arm(NamedTuple):
@@ -73,17 +76,19 @@ def look_at_frames(arm, q):
 
 @njit(cache=True)
 def look_at_grasp(arm, q, target):
-    """Fill arm.grasp_y for the configuration q (7,) and a hand target (4,)."""
+    """Fill arm.grasp_y for the configuration q (7,) and a hand target (TARGET,)."""
     for i in range(ARM):
         arm.grasp_x[i] = q[i]
     for i in range(4):
-        arm.grasp_x[ARM + i], arm.grasp_x[ARM + 4 + i] = arm.base[i], target[i]
+        arm.grasp_x[ARM + i] = arm.base[i]
+    for i in range(TARGET):
+        arm.grasp_x[ARM + 4 + i] = target[i]
     call(arm.grasp_f)
 
 
 @njit(cache=True)
 def finger_turn(arm, q0, q1):
-    """By how much the downward hand's finger axis (its y) turns from q0 to q1, rad."""
+    """By how much the finger axis (the hand's y), level at both, turns from q0 to q1, rad."""
     return _finger_angle(arm, q1) - _finger_angle(arm, q0)
 
 
@@ -103,7 +108,7 @@ def _finger_angle(arm, q):
 @cache
 def functions() -> Functions:
     """Build and compile the functions (once a process)."""
-    q, base, target = ca.SX.sym("q", ARM), ca.SX.sym("base", 4), ca.SX.sym("target", 4)
+    q, base, target = ca.SX.sym("q", ARM), ca.SX.sym("base", 4), ca.SX.sym("target", TARGET)
     T = ca.SX.eye(4)
     T[:3, :3] = _about_z(base[3])
     T[:3, 3] = base[:3]
@@ -132,15 +137,19 @@ def functions() -> Functions:
     frames = frames_of("frames", LINKS)
     all_frames = frames_of("all_frames", (*LINKS, *UPPER_LINKS))
 
-    # Switch constraint: hand at target[:3], z axis down, finger axis (y) along angle target[3]
-    # up to half turns (the gripper is symmetric).
+    # Switch constraint: hand at target[:3], its z axis down but for the lean target[4] about the
+    # finger axis (y), which is along angle target[3] up to half turns (the gripper is symmetric).
     R, p = T_world["panda_hand"][0][:3, :3], T_world["panda_hand"][0][:3, 3]
-    across = -ca.sin(target[3]) * R[0, 1] + ca.cos(target[3]) * R[1, 1]
-    residual = ca.vertcat(p - target[:3], R[0, 2], R[1, 2], across)
+    along = ca.vertcat(ca.cos(target[3]), ca.sin(target[3]), 0)
+    left = ca.vertcat(-ca.sin(target[3]), ca.cos(target[3]), 0)
+    aside = ca.cos(target[4]) * left - ca.sin(target[4]) * ca.vertcat(0, 0, 1)
+    down, fingers = R[:, 2], R[:, 1]
+    level = ca.vertcat(ca.dot(down, along), ca.dot(down, aside), ca.dot(fingers, aside))
+    residual = ca.vertcat(p - target[:3], level)
     flat = ca.vertcat(
         residual,
         ca.vec(ca.jacobian(residual, q).T),
-        ca.vec(ca.jacobian(residual, target).T),
+        ca.vec(ca.jacobian(residual, target)[:, :4].T),
     )
     grasp = ca.Function("grasp", [ca.vertcat(q, base, target)], [ca.cse(ca.densify(flat))])
     return Functions(*load([frames, all_frames, grasp]))
@@ -160,7 +169,8 @@ _A1, _A2 = math.atan2(_OFFSET, _UPPER), math.atan2(_OFFSET, _FORE)
 
 @njit(cache=True)
 def hand_down(target, base, lower, upper, q, way=0.0):
-    """Fill q (7,) with the planar solution for a hand target (x, y, z, finger angle).
+    """Fill q (7,) with the planar solution for a hand target (x, y, z, finger angle) that does
+    not lean.
 
     way: 1 or -1 for the hand's y along or against the finger angle, 0 for what turns least.
     Returns whether it exists within the joint limits.
@@ -189,6 +199,14 @@ def hand_down(target, base, lower, upper, q, way=0.0):
         q[6] = math.pi / 4 + turn + (math.pi if way > 0 else 0.0)
         q[6] -= 2 * math.pi * math.floor(q[6] / (2 * math.pi) + 0.5)
     return (q >= lower).all() and (q <= upper).all()
+
+
+def upright_twin(
+    shift: np.ndarray, height: np.ndarray, tilt: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far to the left and how high hands that do not lean have the wrists of those that lean
+    and are there, m."""
+    return shift + _FLANGE * np.sin(tilt), height - _FLANGE * (1 - np.cos(tilt))
 
 
 def facing(way: float) -> float:

@@ -24,7 +24,7 @@ from relevance.planner.kernels.boxes import (
     separation,
     step_length,
 )
-from relevance.planner.kernels.kinematics import FRAME, look_at_frames, look_at_grasp
+from relevance.planner.kernels.kinematics import FRAME, TARGET, look_at_frames, look_at_grasp
 from relevance.planner.kernels.rows import (
     WIDTH,
     acceleration_cost,
@@ -61,7 +61,7 @@ _EXCHANGES = 4
 
 @njit(cache=True)
 def reach_to(arm, q, target):
-    """Move q (7,) in place to a hand target (4,) by damped Gauss-Newton; whether it got there."""
+    """Move q (7,) in place to a hand target by damped Gauss-Newton; whether it got there."""
     A, b = np.zeros((ARM, ARM)), np.zeros(ARM)
     worst = 0.0
     for _ in range(25):
@@ -97,7 +97,7 @@ def distances(arm, q, bodies, obstacles, out):
     look_at_frames(arm, q)
     for b in range(len(bodies.link)):
         at = bodies.link[b] * FRAME
-        body_pose(arm.frames_y[at : at + FRAME], bodies.centre[b], p, R)
+        body_pose(arm.frames_y[at : at + FRAME], bodies.centre[b], bodies.turn[b], p, R)
         for w in range(len(obstacles)):
             out[b, w] = 1.0
             if near(p, bodies.radius[b] + FAR, obstacles[w]):
@@ -144,7 +144,7 @@ def assemble(
                     merit += 0.5 * mu * shifted * shifted
                     g[at + i] += mu * shifted * (-1.0 if side == 0 else 1.0)
                     band[at + i, 0] += mu
-        if targets[t, 4] > 0:  # straight over a switch
+        if targets[t, TARGET] > 0:  # straight over a switch
             look_at_grasp(arm, X[t], targets[t])
             for r in range(6):
                 value = arm.grasp_y[r]
@@ -177,7 +177,7 @@ def assemble(
                 looked = True
             start = bodies.link[b] * FRAME
             frame = arm.frames_y[start : start + FRAME]
-            body_pose(frame, bodies.centre[b], p, R)
+            body_pose(frame, bodies.centre[b], bodies.turn[b], p, R)
             room[n, b] = 1.0
             for w in range(len(obstacles)):
                 gap = apart(p, bodies.radius[b] + margin[b, w], obstacles[w])
@@ -215,8 +215,8 @@ def assemble(
 def solve(X, arm, bodies, obstacles, margin, samples, targets):
     """Improve the rows X (T + 1, 7) in place, first and last fixed; returns the violation.
 
-    targets (T + 1, 5): hand target (x, y, z, finger angle) of the vertical rows, last column 1
-    there. samples (S, 2): (row, share of the next row) where clearance is asked for.
+    targets (T + 1, TARGET + 1): hand target of the vertical rows, last column 1 there.
+    samples (S, 2): (row, share of the next row) where clearance is asked for.
     """
     T = len(X) - 1
     n = (T - 1) * ARM
@@ -285,7 +285,7 @@ def dense_check(X, arm, bodies, obstacles, margin, broken):
                 b, w = pairs[i]
                 if b != before:
                     at = bodies.link[b] * FRAME
-                    body_pose(arm.frames_y[at : at + FRAME], bodies.centre[b], p, R)
+                    body_pose(arm.frames_y[at : at + FRAME], bodies.centre[b], bodies.turn[b], p, R)
                     before = b
                 gap = separation(p, R, bodies.half[b], obstacles[w], normal, contact)
                 worst = max(worst, -gap)
@@ -309,7 +309,7 @@ def close_pairs(arm, q0, q1, bodies, obstacles, pairs):
     for b in range(len(bodies.link)):
         at = bodies.link[b] * FRAME
         frame = arm.frames_y[at : at + FRAME]
-        body_pose(frame, bodies.centre[b], p, R)
+        body_pose(frame, bodies.centre[b], bodies.turn[b], p, R)
         x, y, z = bodies.centre[b, 0], bodies.centre[b, 1], bodies.centre[b, 2]
         arm_length = math.sqrt(x * x + y * y + z * z) + bodies.radius[b]
         shift, turn = 0.0, 0.0
@@ -333,7 +333,7 @@ def close_pairs(arm, q0, q1, bodies, obstacles, pairs):
 def motion(X, arm, leave, leaving, arrive, bodies, obstacles) -> tuple[float, float, float]:
     """Fill the rows X (ROWS + 1, 7) between its first and last.
 
-    leave / arrive: hand targets (4,) of the two switches; without `leaving` the motion starts
+    leave / arrive: hand targets of the two switches; without `leaving` the motion starts
     free. Returns the worst penetration (m; -1 where no motion was found that keeps the dense
     check within ALLOWED), the cost (rad^2) and the time between rows (s).
     """
@@ -347,7 +347,7 @@ def motion(X, arm, leave, leaving, arrive, bodies, obstacles) -> tuple[float, fl
             margin[b, w] = min(CLEARANCE, first[b, w], last[b, w]) - 1e-4
             if margin[b, w] < -ALLOWED:
                 return -1.0, 0.0, 0.0
-    targets = np.zeros((ROWS + 1, 5))
+    targets = np.zeros((ROWS + 1, TARGET + 1))
     if not _guess(X, arm, leave, leaving, arrive, bodies, obstacles, targets):
         return -1.0, 0.0, 0.0
     samples = np.zeros((2 * ROWS + (_EXCHANGES - 1) * ROWS, 2))
@@ -420,10 +420,10 @@ def _column(X, arm, q, switch, row, direction, safe, targets):
     """Rows over one switch; q becomes the highest reachable configuration up to `safe`."""
     for k in range(VERTICAL):
         height = RISE * ((k + 1) / VERTICAL) ** 2
-        for i in range(4):
+        for i in range(TARGET):
             targets[row, i] = switch[i]
         targets[row, 2] += height
-        targets[row, 4] = 1.0
+        targets[row, TARGET] = 1.0
         if not reach_to(arm, q, targets[row]):
             return False
         assign(X[row], q)

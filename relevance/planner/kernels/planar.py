@@ -1,4 +1,4 @@
-"""The downward hand in the plane: what is in its way, and where a held box is free.
+"""The hand in the plane: what is in its way, and where a held box is free.
 
 A box in the hand is a set of rectangles that share one angle (box, finger tips, fingers, palm),
 each with the height of its underside; it comes straight down, so an obstacle matters to a part
@@ -18,7 +18,7 @@ from relevance.scene.geometry import UPRIGHT, rectangle_gap, upright
 
 MARGIN = 0.003
 """Clearance that placements keep, m; the later bounds ask for less, so they never refuse it."""
-PICK_MARGIN = 0.003
+PICK_MARGIN = 0.001
 """Clearance of the gripper around a box that it takes, m."""
 COMFORT = 0.008
 """Clearance beyond MARGIN with which a pose is taken at once, m."""
@@ -37,7 +37,7 @@ FOUND, NONE, UNDECIDED = 1, 0, 2
 def pick_blockers(i, axes, parts, obstacles, room, blocking):
     """Fill blocking (G, N) bool: which boxes are in the way of taking box i with each grasp.
 
-    axes (G,), parts (G, 5, 5): of the grasps. obstacles (N, UPRIGHT): all the boxes. room: asked
+    axes (G,), parts (G, P, 5): of the grasps. obstacles (N, UPRIGHT): all the boxes. room: asked
     for around the hand, m. Returns how close the closest decision was, m.
     """
     closest = 1.0
@@ -117,15 +117,15 @@ def volumes(parts, pose, bottom, top, sky):
 def slack(x, y, angle, bottom, parts, obstacles, table, base, reach, enough):
     """How well (x, y, angle) satisfies clearance, table edge and reach; feasible iff >= 0. m.
 
-    parts (V, 5, 5), reach (V, 4: distances near and far, middle and half width of the finger axis'
-    turn against the bearing): of the ways in which the hand may hold the box; the best counts.
+    parts (V, P, 5), reach (V, 5: how far the wrist is to the left of the finger axis, the distances
+    near and far that it may have, middle and half width of the finger axis' turn against its
+    bearing): of the ways in which the hand may hold the box; the best counts.
     Below `-enough` it is not computed to the end. Returns (slack, which way).
     """
     c, s = abs(math.cos(angle)), abs(math.sin(angle))
     along, across = parts[0, 0, 2], parts[0, 0, 3]
     shared = table[0] - abs(x) - c * along - s * across
     shared = min(shared, table[1] - abs(y) - s * along - c * across)
-    r = math.sqrt((x - base[0]) ** 2 + (y - base[1]) ** 2)
     if shared < -0.2:
         return shared, 0
     shared = min(shared, clearance(x, y, angle, bottom, parts[0, :1], obstacles) - MARGIN)
@@ -133,13 +133,14 @@ def slack(x, y, angle, bottom, parts, obstacles, table, base, reach, enough):
         return shared, 0
     best, which = -1.0, 0
     for v in range(len(parts)):
-        worst = min(shared, min(reach[v, 1] - r, r - reach[v, 0]))
-        if reach[v, 3] < ANY_TURN:
-            left = parts[v, -1, 1]
-            hx, hy = x - left * math.sin(angle) - base[0], y + left * math.cos(angle) - base[1]
-            off = angle - math.atan2(hy, hx) - reach[v, 2]
+        left = reach[v, 0]
+        wx, wy = x - left * math.sin(angle) - base[0], y + left * math.cos(angle) - base[1]
+        r = math.sqrt(wx * wx + wy * wy)
+        worst = min(shared, min(reach[v, 2] - r, r - reach[v, 1]))
+        if reach[v, 4] < ANY_TURN:
+            off = angle - math.atan2(wy, wx) - reach[v, 3]
             off -= 2 * math.pi * math.floor(off / (2 * math.pi) + 0.5)
-            worst = min(worst, TURN * (reach[v, 3] - TURN_MARGIN - abs(off)))
+            worst = min(worst, TURN * (reach[v, 4] - TURN_MARGIN - abs(off)))
         if worst > best:
             hand = clearance(x, y, angle, bottom, parts[v, 1:], obstacles) - MARGIN
             worst = min(worst, hand)
@@ -166,6 +167,7 @@ def find_pose(region, prefer, bottom, parts, obstacles, table, base, reach, ease
     hx, hy, ha = a / nx, b / ny, math.pi / (2 * na)
     spin = 0.0
     for v in range(len(parts)):
+        spin = max(spin, abs(reach[v, 0]))
         for i in range(parts.shape[1]):
             offset, left = abs(parts[v, i, 0]), abs(parts[v, i, 1])
             if left == 0.0:
