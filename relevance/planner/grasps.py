@@ -1,13 +1,12 @@
 """How the hand takes a box, and what then moves with the arm.
 
 The hand points down over the box. In the plane it is a set of rectangles that share one angle
-(box, finger tips, fingers, both halves of the palm); for the bounds that look at the arm it is boxes on its links.
+(box, finger tips, fingers, both halves of the palm); for the bounds that look at the arm it is
+boxes on its links.
 
-A box has a family of grasps: across both edges that fit the hand, with the finger tips at several
-depths, with the hand shifted along the box, and with the hand leaning along it (the box stays
-level). A hold is sound when at least GRIP of the pads' height and the middle line of the pads,
-INSET from the corner, lie on the face. Deep, centred and upright is preferred: what a hold lacks
-of that is a price in the plan's cost.
+A box has families of grasps (`kernels.holds`): across both edges that fit the hand, with the
+finger tips at several depths, with the hand shifted along the box, and with the hand leaning along
+it, the box level.
 """
 
 from __future__ import annotations
@@ -22,32 +21,18 @@ from typing import NamedTuple
 import numpy as np
 
 from relevance.planner.kernels.boxes import Bodies
-from relevance.planner.kernels.kinematics import upright_twin
+from relevance.planner.kernels.holds import (
+    COLUMNS,
+    SHALLOW,
+    SPREAD,
+    TILTS,
+    WRIST_ABOVE,
+    WRIST_LEFT,
+    sound_holds,
+)
+from relevance.planner.kernels.kinematics import FLANGE
 from relevance.robot import HAND, panda
 from relevance.scene import Box
-
-DEPTH = 0.025
-"""How far the finger tips reach below the top of the box that they hold, at most, m."""
-SHALLOW = (0.012, 0.006)
-"""Smaller depths, m; a box is held as deep as its neighbours allow."""
-GRIP = 0.005
-"""Least height of the pads that lies on the face of a held box, m."""
-GROUND = 0.004
-"""What the finger tips keep from what the box stands on, m."""
-INSET = 0.01
-"""Least distance of the pads' middle line from the corner of a held box, m."""
-FARTHEST = 0.04
-"""Farthest that the hand is shifted along a box, m."""
-SPREAD = 0.002
-"""How far each finger stands off the box before it closes, m."""
-TILTS = (0.2, -0.2, 0.4, -0.4, 0.6, -0.6)
-"""How far the hand may lean to the left of the finger axis, rad."""
-PALM_ROOM = 0.003
-"""What a leaning palm keeps from the box that it holds, m."""
-PRICE = 20.0
-"""Price of a hold for each metre that it is shallower, or farther from the middle, rad^2/m."""
-LEAN_PRICE = 3.0
-"""Price of a hold for each radian that the hand leans, rad^2/rad."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -89,15 +74,15 @@ class Family:
     axes: np.ndarray
     """(G,)."""
     rows: np.ndarray
-    """(G, 7): above, depth, shift, tilt, wrist (2) and price of each."""
+    """(G, COLUMNS): as `kernels.holds` has them."""
     parts: np.ndarray
-    """(G, P, 5)."""
+    """(G, P, 5): `Grasp.parts` of each."""
     _made: dict[int, Grasp] = field(default_factory=dict)
 
     @property
     def wrists(self) -> np.ndarray:
         """(G, 2): `Grasp.wrist` of each."""
-        return self.rows[:, 4:6]
+        return self.rows[:, WRIST_LEFT : WRIST_ABOVE + 1]
 
     def __len__(self) -> int:
         return len(self.axes)
@@ -118,26 +103,16 @@ class Family:
         return (self[number] for number in range(len(self)))
 
 
-class _Ways(NamedTuple):
-    """What a family chooses from, (G,) each."""
-
-    tilts: np.ndarray
-    """Index among 0 and TILTS."""
-    shares: np.ndarray
-    """Of the farthest shift of the pads."""
-    depths: np.ndarray
-    """0 for the deepest, else index + 1 in SHALLOW."""
-
-
 _SHARES = (0.0, 0.5, -0.5, 1.0, -1.0)
 _DEEP, _OTHERS, _LEANING = (
-    _Ways(*map(np.array, zip(*ways, strict=True)))
+    np.array(list(ways), float)
     for ways in (
         [(0, 0.0, 0)],
         [*product((0,), _SHARES, range(1 + len(SHALLOW)))][1:],
-        [*product(range(1, 1 + len(TILTS)), _SHARES, (0, 1))],
+        product(range(1, len(TILTS)), _SHARES, (0, 1)),
     )
 )
+"""What the families choose from, as `sound_holds` has it."""
 
 
 def grasps(box: Box) -> tuple[Grasp, ...]:
@@ -170,50 +145,20 @@ def _others(size: tuple[float, float, float]) -> Family:
     return _family(size, _OTHERS)
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=128)
 def _leaning(size: tuple[float, float, float]) -> Family:
     return _family(size, _LEANING)
 
 
-def _family(size: tuple[float, float, float], ways: _Ways) -> Family:
-    """The sound ones of some ways to take a box, narrower edge first."""
-    hand, height = _hand(), size[2]
-    deep = min(DEPTH, max(height - 0.012, 0.3 * height, min(0.010, height - GROUND)))
-    tilts = np.array([0.0, *TILTS])[ways.tilts]
-    s, c = np.sin(tilts), np.cos(tilts)
-    deepest = np.minimum(deep, height - GROUND - hand.across[0] * abs(s))  # of the lower corner
-    depths = np.where(ways.depths == 0, deepest, np.array([0.0, *SHALLOW])[ways.depths])
-    fair = (depths >= GRIP) & ((ways.depths == 0) | (depths < deepest - 0.002))
-    found = []
-    for axis in (0, 1) if size[0] <= size[1] else (1, 0):
-        opening, edge = size[axis] / 2 + SPREAD, size[1 - axis] / 2
-        if opening > hand.max_opening:
-            continue
-        most = min(edge - INSET, FARTHEST)
-        shifts = ways.shares * (most if most > INSET / 2 else 0.0)
-        # Where, on the side that the hand leans to, the box's top is nearest to the palm.
-        palm = len(hand.sides)
-        end = np.minimum(edge - shifts * np.sign(s), (hand.across[palm] + depths * abs(s)) / c)
-        sound = fair & (end * abs(s) + depths * c <= hand.near[palm] - PALM_ROOM)
-        sound &= (shifts != 0) | (ways.shares == 0)
-        shift, depth, tilt = shifts[sound], depths[sound], tilts[sound]
-        parts = np.empty((len(shift), 1 + len(hand.near), 5))
-        parts[:, 0] = 0.0, 0.0, size[axis] / 2, edge, 0.0
-        parts[:, 1:] = _over_tips()[ways.tilts[sound]]
-        parts[:, 1 : 1 + palm, 0] += hand.sides * opening
-        parts[:, 1:, 1] += shift[:, None]
-        parts[:, 1:, 4] += (height - depth)[:, None]
-        left = shift + hand.tip * s[sound]
-        above = height / 2 - depth + hand.tip * c[sound]
-        price = PRICE * (deep - depth + abs(shift)) + LEAN_PRICE * abs(tilt)
-        rows = above, depth, left, tilt, *upright_twin(left, above, tilt), price
-        found.append((np.full(len(shift), axis), np.column_stack(rows), parts))
-    if not found:
-        return Family(
-            size=size, axes=np.empty(0, int), rows=np.empty((0, 7)), parts=np.empty((0, 1, 5))
-        )
-    axes, rows, parts = map(np.concatenate, zip(*found, strict=True))
-    return Family(size=size, axes=axes, rows=rows, parts=parts)
+def _family(size: tuple[float, float, float], ways: np.ndarray) -> Family:
+    hand, most = _hand(), 2 * len(ways)
+    axes, rows = np.empty(most, np.int64), np.empty((most, COLUMNS))
+    parts = np.empty((most, 1 + len(hand.shape), 5))
+    count = sound_holds(
+        np.array(size), ways, hand.shape, hand.over, hand.tip, hand.max_opening, FLANGE, axes, rows,
+        parts,
+    )  # fmt: skip
+    return Family(size=size, axes=axes[:count], rows=rows[:count], parts=parts[:count])
 
 
 def fits(box: Box) -> bool:
@@ -305,56 +250,34 @@ def _bodies(rows: list[tuple[int, np.ndarray, np.ndarray]]) -> Bodies:
     return Bodies(link, centre, half, np.zeros(len(link)), np.sqrt((half**2).sum(1)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Hand:
+class _Hand(NamedTuple):
     """The hand as boxes along its axes: the finger tips, the fingers, the halves of the palm."""
 
-    middle: np.ndarray
-    """(P,): of each along the finger axis, fingers shut, m."""
-    along: np.ndarray
-    """(P,): half extents along the finger axis, m."""
-    across: np.ndarray
-    """(P,): the same across it, either way round, m."""
-    near: np.ndarray
-    """(P,): where each begins, from the tips up, m."""
-    far: np.ndarray
-    """(P,): where it ends, m."""
-    sides: np.ndarray
-    """(P - 2,): which way opening moves each finger part along the finger axis."""
+    shape: np.ndarray
+    """(P, 3): as `sound_holds` has it."""
+    over: np.ndarray
+    """(T, P, 5): likewise."""
     tip: float
     max_opening: float
 
 
 @cache
 def _hand() -> _Hand:
-    arm = panda()
-    rows, sides = [], []
+    arm, boxes = panda(), []
     for low, high in arm.finger:
         for side in (1.0, -1.0):
             middle, across = side * (low[1] + high[1]) / 2, max(abs(low[0]), abs(high[0]))
-            rows.append((middle, (high[1] - low[1]) / 2, across, high[2], low[2]))
-            sides.append(side)
+            boxes.append((middle, (high[1] - low[1]) / 2, across, high[2], low[2], side))
     for _, centre, half in arm.arm[-2:]:
         reach = np.abs(centre) + half
-        rows.append((0.0, reach[1], reach[0], centre[2] + half[2], centre[2] - half[2]))
-    middle, along, across, low, high = np.array(rows).T
-    return _Hand(
-        middle=middle, along=along, across=across, near=arm.finger_tip - low,
-        far=arm.finger_tip - high, sides=np.array(sides), tip=arm.finger_tip,
-        max_opening=arm.max_opening,
-    )  # fmt: skip
-
-
-@cache
-def _over_tips() -> np.ndarray:
-    """The hand with shut fingers over the middle of its tips, leaning by 0 and by TILTS, as
-    `Grasp.parts` has it, (T, P, 5)."""
-    hand, found = _hand(), []
-    for tilt in (0.0, *TILTS):
-        s, c = math.sin(tilt), math.cos(tilt)
-        ends, aside = (hand.near * s, hand.far * s), hand.across * c
-        low, high = np.minimum(*ends) - aside, np.maximum(*ends) + aside
-        under = hand.near * c - hand.across * abs(s)
-        columns = hand.middle, (low + high) / 2, hand.along, (high - low) / 2, under
-        found.append(np.column_stack(columns))
-    return np.array(found)
+        boxes.append((0.0, reach[1], reach[0], centre[2] + half[2], centre[2] - half[2], 0.0))
+    middle, along, across, low, high, sides = np.array(boxes).T
+    near, far, over = arm.finger_tip - low, arm.finger_tip - high, []
+    for s, c in ((math.sin(tilt), math.cos(tilt)) for tilt in TILTS):
+        left = np.minimum(near * s, far * s) - across * c
+        right = np.maximum(near * s, far * s) + across * c
+        under = near * c - across * abs(s)
+        columns = middle, (left + right) / 2, along, (right - left) / 2, under
+        over.append(np.column_stack(columns))
+    shape = np.column_stack([across, near, sides])
+    return _Hand(shape, np.array(over), arm.finger_tip, arm.max_opening)

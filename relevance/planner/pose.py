@@ -139,7 +139,7 @@ class PoseBound:
         """
         problem = self.problem
         subject = problem.subject
-        deep = set(deep_grasps(subject))
+        deep = set(self._blockers(subject.name, deep_grasps).family)
         standing: np.ndarray | None = None
         taken = frozenset(problem.boxes) if everywhere else gone
         choices = self.choices(subject.name, taken)

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-
 NEAR = 0.003
 """More than what any bound asks two boxes to be apart, m."""
 

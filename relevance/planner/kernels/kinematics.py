@@ -22,6 +22,8 @@ TARGET = 5
 leans to the left of that axis (rad): 0 where it points straight down."""
 FRAME = 54
 """Numbers a frame takes in the output of `frames`: p (3), R (9), Jv (21), Jw (21), row-major."""
+FLANGE = 0.107
+"""Distance of the hand's origin from the wrist, along the hand's z, m."""
 LIMIT_MARGIN = 1e-3
 """How far inside the joint limits the solvers aim, rad: more than they may be off."""
 
@@ -162,7 +164,7 @@ def _about_z(angle):
 
 # Hand-down inverse kinematics in closed form: with q3 = q5 = 0 the arm is planar, and the hand
 # points down exactly when q6 = q2 - q4.
-_SHOULDER, _UPPER, _OFFSET, _FORE, _WRIST, _FLANGE = 0.333, 0.316, 0.0825, 0.384, 0.088, 0.107
+_SHOULDER, _UPPER, _OFFSET, _FORE, _WRIST = 0.333, 0.316, 0.0825, 0.384, 0.088
 _L1, _L2 = math.hypot(_UPPER, _OFFSET), math.hypot(_FORE, _OFFSET)
 _A1, _A2 = math.atan2(_OFFSET, _UPPER), math.atan2(_OFFSET, _FORE)
 
@@ -179,7 +181,7 @@ def hand_down(target, base, lower, upper, q, way=0.0):
     dx, dy = target[0] - base[0], target[1] - base[1]
     x, y = c * dx + s * dy, c * dy - s * dx
     wrist = math.sqrt(x * x + y * y) - _WRIST
-    height = target[2] - base[2] + _FLANGE - _SHOULDER
+    height = target[2] - base[2] + FLANGE - _SHOULDER
     reach = math.sqrt(wrist * wrist + height * height)
     if reach >= _L1 + _L2 or reach <= abs(_L1 - _L2) or reach < 1e-6:
         return False
@@ -199,14 +201,6 @@ def hand_down(target, base, lower, upper, q, way=0.0):
         q[6] = math.pi / 4 + turn + (math.pi if way > 0 else 0.0)
         q[6] -= 2 * math.pi * math.floor(q[6] / (2 * math.pi) + 0.5)
     return (q >= lower).all() and (q <= upper).all()
-
-
-def upright_twin(
-    shift: np.ndarray, height: np.ndarray, tilt: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """How far to the left and how high hands that do not lean have the wrists of those that lean
-    and are there, m."""
-    return shift + _FLANGE * np.sin(tilt), height - _FLANGE * (1 - np.cos(tilt))
 
 
 def facing(way: float) -> float:

@@ -56,7 +56,7 @@ ROUGH_STEP = 1e-2
 """The same before the multipliers are set for the first time, rad."""
 TOLERANCE = 4e-4
 """Largest violation of a solved problem, m or rad."""
-_EXCHANGES = 4
+_EXCHANGES = 6
 
 
 @njit(cache=True)
