@@ -100,6 +100,18 @@ class PoseBound:
         blocked = (self._blockers(name, family) for family in FAMILIES)
         return next((some.free(everything) for some in blocked if some.sets), ())
 
+    def spread(self, name: str) -> np.ndarray:
+        """How far from the object's centre anything reaches that holds it, and how high over its
+        underside that begins, (K, 2), m."""
+        found = []
+        for family in FAMILIES:
+            parts = self._blockers(name, family).family.parts
+            if len(parts):
+                x, y, along, across = np.moveaxis(abs(parts[..., :4]), -1, 0)
+                outer = np.hypot(x + along, y + across).max(0)
+                found.append(np.column_stack([outer, parts[..., 4].min(0)]))
+        return np.concatenate(found)
+
     def pickable(self, name: str, gone: frozenset[str]) -> bool:
         """Whether the object can be taken once the objects in `gone` have left."""
         self.problem.counts.pose += 1

@@ -13,7 +13,6 @@ set, the others only when that fails.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -461,15 +460,11 @@ class _Search:
         """Objects whose leaving can make room in the goal region; and the reference."""
         problem = self.problem
         subject, reference = problem.subject, problem.reference
-        spread = max(
-            math.hypot(abs(part[0]) + part[2], part[3])
-            for grasp in self.pose.grasps(subject.name)
-            for part in grasp.parts
-        )
-        boxes = problem.obstacles[: len(problem.boxes)]
-        near, wider = {reference.name}, spread + 0.01
+        boxes, near = problem.obstacles[: len(problem.boxes)], {reference.name}
+        bottom = reference.top if problem.goal.predicate.stacked else 0.0
+        spread = self.pose.spread(subject.name)
         for area in problem.goal_regions(reference):
-            near.update(compress(problem.boxes, reaching_into(area, wider, boxes)))
+            near.update(compress(problem.boxes, reaching_into(area, bottom, spread, boxes)))
         return frozenset(near) - {subject.name}
 
     def _in_the_way(self, chosen: frozenset[str]) -> frozenset[str]:

@@ -62,15 +62,24 @@ def pick_blockers(i, axes, parts, obstacles, room, blocking):
 
 
 @njit(cache=True)
-def reaching_into(area, wider, obstacles):
-    """Which obstacles (W, UPRIGHT) overlap, seen from above, a rectangle (5,: centre x, y, angle,
-    half extents) that is this much wider on all sides, m: (W,) bool."""
+def reaching_into(area, bottom, spread, obstacles):
+    """Which obstacles (W, UPRIGHT) can be in the way of what is put down, with its underside at
+    this height, with its centre in a rectangle (5,: centre x, y, angle, half extents), (W,) bool.
+
+    spread (K, 2): how far from its centre that and the hand reach, from which height over its
+    underside on, m.
+    """
     found = np.zeros(len(obstacles), np.bool_)
     c, s = math.cos(area[2]), math.sin(area[2])
     for w in range(len(obstacles)):
-        o, a, b = obstacles[w], area[3] + wider, area[4] + wider
-        gap = rectangle_gap(area[0], area[1], c, s, a, b, o[0], o[1], o[8], o[9], o[4], o[5])
-        found[w] = gap <= 0
+        o, wider = obstacles[w], -1.0
+        for k in range(len(spread)):
+            if o[2] + o[6] > bottom + spread[k, 1] - 2 * MARGIN:
+                wider = max(wider, spread[k, 0] + 2 * MARGIN)
+        if wider > 0:
+            a, b = area[3] + wider, area[4] + wider
+            gap = rectangle_gap(area[0], area[1], c, s, a, b, o[0], o[1], o[8], o[9], o[4], o[5])
+            found[w] = gap <= 0
     return found
 
 
