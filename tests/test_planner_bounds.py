@@ -10,9 +10,10 @@ import pybullet
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import linprog
 
 from relevance import _kernel_cache
-from relevance.planner.grasps import bodies, grasps
+from relevance.planner.grasps import Held, bodies, grasps
 from relevance.planner.kernels import motions, native, planar
 from relevance.planner.kernels.boxes import (
     banded_solve,
@@ -121,7 +122,7 @@ def test_grasp_jacobians_equal_finite_differences():
         return functions().grasp.y.copy()
 
     for _ in range(10):
-        x = np.r_[random_q(rng), BASE, rng.uniform(-0.5, 0.5, 4)]
+        x = np.r_[random_q(rng), BASE, rng.uniform(-0.5, 0.5, 5)]
         y = residual(x)
         J = np.hstack([y[6:48].reshape(6, 7), y[48:72].reshape(6, 4)])
         for column, i in enumerate([*range(7), *range(11, 15)]):
@@ -138,7 +139,7 @@ def test_hand_down_solves_the_grasp_exactly():
         if not hand_down(target, BASE, arm.lower, arm.upper, q):
             continue
         reached += 1
-        functions().grasp.x[:] = np.r_[q, BASE, target]
+        functions().grasp.x[:] = np.r_[q, BASE, target, 0.0]
         call(functions().grasp.handle)
         assert np.abs(functions().grasp.y[:6]).max() < 1e-9
         assert frames_at(q)[2, 3:12].reshape(3, 3)[2, 2] < -0.999, "the hand points down"
@@ -241,6 +242,26 @@ def test_separation_gradient_equals_finite_differences():
     assert checked == 200
 
 
+def test_two_boxes_are_apart_exactly_where_no_point_is_in_both():
+    rng, n, x, apart = np.random.default_rng(11), np.zeros(3), np.zeros(3), 0
+    for _ in range(300):
+        p, half = rng.uniform(-0.09, 0.09, 3), rng.uniform(0.01, 0.05, 3)
+        R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        obstacle = np.r_[
+            rng.uniform(-0.05, 0.05, 3), rng.uniform(-3, 3), rng.uniform(0.02, 0.06, 3)
+        ]
+        d = separation(p, R, half, obstacle_rows([obstacle])[0], n, x)
+        c, s = math.cos(obstacle[3]), math.sin(obstacle[3])
+        U = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        A = np.vstack([R.T, -R.T, U.T, -U.T])
+        b = np.r_[R.T @ p + half, half - R.T @ p, U.T @ obstacle[:3] + obstacle[4:],
+                  obstacle[4:] - U.T @ obstacle[:3]]  # fmt: skip
+        shared = linprog(np.zeros(3), A_ub=A, b_ub=b, bounds=(None, None)).status == 0
+        assert shared == (d <= 0)
+        apart += not shared
+    assert 100 < apart < 200
+
+
 def test_banded_solve_equals_dense():
     rng, n, width = np.random.default_rng(5), 30, 5
     L = np.tril(rng.normal(size=(n, n)))
@@ -263,8 +284,8 @@ def test_path_gradient_equals_finite_differences():
     for t in range(7):
         hand_down(np.array([0.0 + 0.03 * t, 0.02, 0.2, 0.4]), BASE, arm.lower, arm.upper, X[t])
     X += rng.normal(scale=0.01, size=X.shape)
-    targets = np.zeros((7, 5))
-    targets[5] = 0.15, 0.02, 0.21, 0.4, 1.0
+    targets = np.zeros((7, 6))
+    targets[5] = 0.15, 0.02, 0.21, 0.4, 0.3, 1.0
     samples = np.array([[t, s] for t in range(6) for s in (0.0, 0.5) if t or s])
     shape = (len(samples), len(body.link), len(obstacles))
     multipliers = rng.uniform(0, 0.1, (7, 6)), rng.uniform(0, 0.1, shape), np.zeros((7, ARM, 2))
@@ -319,7 +340,7 @@ def test_smoothness_is_the_hessian_of_the_cost():
 def test_pairs_called_clear_are_clear_at_every_substep():
     """The dense check skips pairs by a bound on the motion; sampled finely, none comes close."""
     arm, at, rng = panda(), arm_at(BASE), np.random.default_rng(8)
-    body = bodies(0.03, (np.array([0, 0, 0.12]), np.array([0.03, 0.02, 0.05])))
+    body = bodies(0.03, Held(np.array([0, 0, 0.12]), np.array([0.03, 0.02, 0.05]), 0.3))
     obstacles = obstacle_rows(
         [[0.1, 0.0, 0.06, 0.3, 0.05, 0.04, 0.06], [0, 0, -0.05, 0, 0.4, 0.6, 0.05]]
     )
@@ -359,7 +380,7 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
         region = np.array([0.0, 0.0, 0.2, 0.05, 0.03])
         near, far = reach_interval(0.15)
         at = np.zeros(4)
-        reach = np.array([[near, far, 0.0, planar.ANY_TURN]])
+        reach = np.array([[0.0, near, far, 0.0, planar.ANY_TURN]])
         common = (0.0, grasp.parts[None], obstacles, table, BASE, reach)
         status, _ = planar.find_pose(region, np.zeros(2), *common, 0.0, at)
         c, s = math.cos(0.2), math.sin(0.2)

@@ -9,9 +9,21 @@ import pytest
 
 from relevance.planner import PlannerConfig, plan, trajectory
 from relevance.planner.checking import broken
-from relevance.planner.grasps import FARTHEST, GRIP, GROUND, INSET, grasps, other_grasps
+from relevance.planner.grasps import (
+    bodies,
+    carried,
+    grasps,
+    leaning_grasps,
+    other_grasps,
+    pick_target,
+)
+from relevance.planner.kernels.boxes import body_pose
+from relevance.planner.kernels.holds import FARTHEST, GRIP, GROUND, INSET, TILTS
+from relevance.planner.kernels.kinematics import FRAME, arm_at, hand_down, look_at_frames
+from relevance.planner.kernels.motions import reach_to
 from relevance.planner.path import Motion
 from relevance.planner.problem import Problem
+from relevance.robot import panda
 from relevance.scene import Scene, scene_from_json
 from tests.planning import BLUE, GREY, OPEN, RED, box
 
@@ -70,14 +82,55 @@ def test_every_hold_is_sound():
         size = tuple(rng.uniform(0.008, 0.12, 3))
         one = box("b", 0.0, 0.0, size=size)
         deep = grasps(one)
-        for grasp in (*deep, *other_grasps(one).grasps):
+        for grasp in (*deep, *other_grasps(one), *leaning_grasps(one)):
             count += 1
             assert GRIP <= grasp.depth <= size[2] - GROUND + 1e-9
-            assert abs(grasp.shift) <= max(size[1 - grasp.axis] / 2 - INSET, 0.0) + 1e-9
-            assert abs(grasp.shift) <= FARTHEST
+            pads = grasp.shift - panda().finger_tip * math.sin(grasp.tilt)
+            assert abs(pads) <= max(size[1 - grasp.axis] / 2 - INSET, 0.0) + 1e-9
+            assert abs(pads) <= FARTHEST + 1e-9
             assert grasp.price >= 0
             assert (grasp.price == 0) == (grasp in deep)
     assert count > 1000
+
+
+def test_a_leaning_hand_is_where_its_rectangles_say_and_the_box_is_level():
+    one = box("b", 0.1, -0.05, size=(0.05, 0.09, 0.08), yaw=0.4)
+    arm, seen = arm_at(np.array([-0.48, 0.0, 0.0, 0.0])), set()
+    p, R = np.zeros(3), np.zeros((3, 3))
+    for grasp in leaning_grasps(one):
+        target = pick_target(one, grasp)
+        upright = replace(grasp, shift=grasp.wrist[0], above=grasp.wrist[1], tilt=0.0)
+        for way in (1.0, -1.0):
+            q = np.zeros(7)
+            if not hand_down(pick_target(one, upright), arm.base, arm.lower, arm.upper, q, way):
+                continue
+            assert reach_to(arm, q, target)
+            seen.add((grasp.tilt, way))
+            look_at_frames(arm, q)
+            body = bodies(grasp.opening, carried(one, grasp, way))
+            c, s = math.cos(target[3]), math.sin(target[3])
+            ends = []
+            for b in range(len(body.link)):
+                frame = arm.frames_y[body.link[b] * FRAME :][:FRAME]
+                body_pose(frame, body.centre[b], body.turn[b], p, R)
+                reach = np.abs(R) @ body.half[b]
+                assert b < len(body.link) - 1 or np.isclose(reach[2], one.size[2] / 2)
+                corners = p + (np.array(list(np.ndindex(2, 2, 2))) * 2 - 1) * body.half[b] @ R.T
+                local = (corners - one.position) @ [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+                ends.append(np.r_[local.min(0), local.max(0)])
+            hand, held = np.array(ends[-7:-1]), ends[-1]
+            o, left, along, across, under = grasp.parts.T
+            rows = np.column_stack([o - along, left - across, under - one.size[2] / 2, o + along,
+                                    left + across])  # fmt: skip
+            np.testing.assert_allclose(held[:5], rows[0], atol=1e-6)
+            palm = hand[:2]  # its mesh is not quite symmetric, the rectangles are
+            np.testing.assert_allclose(palm[:, [1, 2, 4]], rows[-2:, [1, 2, 4]], atol=1e-4)
+            assert (palm[:, 0] >= rows[-2:, 0] - 1e-6).all()
+            assert (palm[:, 3] <= rows[-2:, 3] + 1e-6).all()
+            fingers = np.sort(hand[2:, :5], axis=0)
+            np.testing.assert_allclose(fingers, np.sort(rows[1:-2], axis=0), atol=2e-4)
+    assert {tilt for tilt, _ in seen} == set(TILTS) - {0.0}
+    assert {way for _, way in seen} == {1.0, -1.0}
 
 
 def test_deep_and_centred_is_preferred():
@@ -87,8 +140,8 @@ def test_deep_and_centred_is_preferred():
     q = result.phases[0].q[-1]
     from relevance.planner.checking import _held
 
-    centre, _ = _held(problem, "red", q)
-    np.testing.assert_allclose(centre, [0.0, 0.0, hold.above], atol=1e-3)
+    centre, _, turn = _held(problem, "red", q)
+    np.testing.assert_allclose([*centre, turn], [0.0, 0.0, hold.above, 0.0], atol=1e-3)
 
 
 def test_a_full_turn_of_yaw_changes_nothing():
