@@ -11,7 +11,7 @@ from relevance.benchmarks.tasks import Task
 from relevance.planner import PlannerConfig, warm_up
 from relevance.report.tables import Table
 
-ROBUST = 0.005
+ROBUST = 0.003
 """Clearance with which a task counts as solvable beyond the reference's resolution, m."""
 
 

@@ -1,10 +1,11 @@
 """An exhaustive reference: every sound hold of a box, every place on a dense grid, any blockers.
 
 It is a referee of the planner's *no*, so it shares none of its assumptions: of the planner it
-takes the URDF's numbers alone. The hand points down and takes a box across either edge that fits,
-either way round, with any offset along the box and depth of the finger tips (on a grid) that
-leaves enough of the pads on the faces (`HELD`). Reach comes from its own inverse kinematics.
-Everything else is brute force over poses with a separating-axis gap in numpy.
+takes the URDF's numbers alone. The hand points down, or leans about the finger axis by TILTS, and
+takes a box across either edge that fits, either way round, with any offset along the box and depth
+of the finger tips (on a grid) that leaves enough of the pads on the faces (`HELD`). Reach comes
+from its own inverse kinematics. Everything else is brute force over poses with a separating-axis
+gap in numpy.
 
 A goal is solvable with a set of boxes gone when they can be taken one after the other and put on
 the table out of everybody's way, and then the subject can be taken and put at the goal in one
@@ -25,16 +26,18 @@ import numpy as np
 from relevance.robot import panda
 from relevance.scene import Box, Goal, Scene
 
-CLEARANCE = 0.003
+CLEARANCE = 0.001
 """What a placed box and the hand (its meshes in boxes, 1 mm wider) keep from everything, m."""
-WIDEST = 0.07
-"""Widest edge that the hand takes (CONTRIBUTING, The words), m."""
-SPREAD = 0.003
+WIDEST = 0.075
+"""Widest edge that the hand takes, m."""
+SPREAD = 0.002
 """How far each finger stands off the box before it closes, m."""
 OFFSET = 0.005
 """Step of the hand's offset along the box, m."""
 DEPTH = 0.004
 """Step of the depth of the finger tips below the box's top, m."""
+TILTS = (0.0, 0.25, -0.25, 0.5, -0.5)
+"""How far the hand leans to the left of the finger axis, rad."""
 PAD = 0.02
 """Width of a finger's pad along the box, m."""
 HELD = (0.015, 0.006)
@@ -85,12 +88,14 @@ def possible(scene: Scene, goal: Goal, gone: Sequence[str], clearance: float = C
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Hold:
-    """The hand pointing down over a box: a direction, an offset, and the depths that are sound."""
+    """The hand over a box: direction, lean and offset, and the depths that are sound."""
 
     turn: float
     """Angle of the finger axis against the box's x, rad."""
+    tilt: float
+    """How far it leans to the left of the finger axis, rad."""
     offset: tuple[float, float]
-    """Of the hand over the box's centre, in the box's axes, m."""
+    """Of the finger tips' middle from the box's, in the box's axes, m."""
     depths: np.ndarray
     """(D,): of the finger tips below the box's top, shallow to deep, m."""
     parts: np.ndarray
@@ -99,50 +104,75 @@ class Hold:
 
 
 def holds(box: Box) -> tuple[Hold, ...]:
-    """Every sound hold of a box on the grid, the most centred first."""
+    """Every sound hold of a box on the grid, the most upright and centred first."""
     arm, found = panda(), []
     height = box.size[2]
     deepest = min(height, arm.finger_tip - arm.palm) - CLEAR_BELOW
     depths = np.arange(min(HELD[1], height / 2), deepest + 1e-9, DEPTH)
-    for axis in (0, 1):
+    for axis, tilt in itertools.product((0, 1), TILTS):
         if box.size[axis] > WIDEST:
             continue
         face = box.size[1 - axis]
         furthest = (face + PAD) / 2 - min(HELD[0], face)
         steps = math.floor(furthest / OFFSET + 1e-9)
-        parts = _hand(box.size[axis] / 2 + SPREAD)
+        parts = _hand(box.size[axis] / 2 + SPREAD, tilt)
         for step, way in itertools.product(range(-steps, steps + 1), (0.0, math.pi)):
             along = step * OFFSET
-            found.append(
-                Hold(
-                    turn=axis * math.pi / 2 + way,
-                    offset=(0.0, along) if axis == 0 else (along, 0.0),
-                    depths=depths,
-                    parts=parts,
+            left = along if (axis == 0) == (way == 0.0) else -along
+            sound = _clear_of_held(depths, height, face, left, tilt)
+            if sound.any():
+                found.append(
+                    Hold(
+                        turn=axis * math.pi / 2 + way,
+                        tilt=tilt,
+                        offset=(0.0, along) if axis == 0 else (along, 0.0),
+                        depths=depths[sound],
+                        parts=parts,
+                    )
                 )
-            )
-    return tuple(sorted(found, key=lambda hold: max(map(abs, hold.offset))))
+    return tuple(sorted(found, key=lambda hold: (abs(hold.tilt), max(map(abs, hold.offset)))))
 
 
-def _hand(opening: float) -> np.ndarray:
-    """The rectangles of the downward hand with its fingers that far apart, as `Hold.parts`."""
-    arm = panda()
-    corners = [(centre - half, centre + half) for link, centre, half in arm.arm if link == 2]
-    rows = [
-        (
-            (low[1] + high[1]) / 2,
-            (low[0] + high[0]) / 2,
-            (high[1] - low[1]) / 2,
-            (high[0] - low[0]) / 2,
-            arm.finger_tip - high[2],
-        )
-        for low, high in corners
-    ]
+def _clear_of_held(
+    depths: np.ndarray, height: float, face: float, left: float, tilt: float
+) -> np.ndarray:
+    """At which depths a hand whose tips are that far to the left of the middle of a face keeps
+    its palm off the box, and its tips off what that stands on, (D,) bool."""
+    arm, s, c = panda(), math.sin(tilt), math.cos(tilt)
+    top = np.linspace(-face / 2 - left, face / 2 - left, 101)[:, None]
+    over, aside = top * s + depths * c, top * c - depths * s
+    palms = [(centre, half) for link, centre, half in arm.arm if link == 2]
+    hit = np.zeros(len(depths), dtype=bool)
+    for centre, half in palms:
+        under = arm.finger_tip - centre[2] - half[2] - CLEAR_BELOW
+        hit |= ((over > under) & (abs(aside) < abs(centre[0]) + half[0])).any(axis=0)
+    corner = max(high[0] for _, high in arm.finger) * abs(s)
+    return ~hit & (depths <= height - CLEAR_BELOW - corner)
+
+
+def _hand(opening: float, tilt: float) -> np.ndarray:
+    """The rectangles of a hand with its fingers that far apart, as `Hold.parts`."""
+    arm, s, c = panda(), math.sin(tilt), math.cos(tilt)
+    boxes = [(centre - half, centre + half) for link, centre, half in arm.arm if link == 2]
     for low, high in arm.finger:
         for side in (1.0, -1.0):  # the right finger is the left one turned by half a turn
-            y, x = (low[1] + high[1]) / 2 + opening, (low[0] + high[0]) / 2
-            half = (high[1] - low[1]) / 2, (high[0] - low[0]) / 2
-            rows.append((side * y, side * x, *half, arm.finger_tip - high[2]))
+            one, two = (side * (end + np.array([0.0, opening, 0.0])) for end in (low, high))
+            one[2], two[2] = low[2], high[2]
+            boxes.append((np.minimum(one, two), np.maximum(one, two)))
+    rows = []
+    for low, high in boxes:
+        x, z = np.meshgrid((low[0], high[0]), (low[2], high[2]))
+        over = arm.finger_tip - z
+        left, up = x * c + over * s, over * c - x * s
+        rows.append(
+            (
+                (low[1] + high[1]) / 2,
+                (left.min() + left.max()) / 2,
+                (high[1] - low[1]) / 2,
+                (left.max() - left.min()) / 2,
+                up.min(),
+            )
+        )
     return np.array(rows)
 
 
@@ -156,6 +186,11 @@ _LINKS = (
 )  # fmt: skip
 _GRID = ((0.10, 0.90, 81), (-0.30, 0.90, 61))
 """Distances from the base's axis and heights over the base that are solved for, m."""
+_LEAN_GRID = ((0.15, 0.90, 26), (-0.15, 0.60, 26), (-math.pi, math.pi, 17))
+"""The same for a hand that leans, and where it leans to against its bearing, rad; one more joint
+decides, and it takes longer."""
+ASIDE = 1.0
+"""How far the first joint may turn from where the leaning hand is, rad."""
 _STARTS = ((0.0, -0.8, 0.0, -2.3, 0.0, 1.6), (0.0, 0.6, 0.0, -1.8, 0.0, 2.4))
 _ROUNDS = 60
 
@@ -182,8 +217,79 @@ def reach_map() -> np.ndarray:
     return reached.reshape(r.shape)
 
 
+@cache
+def lean_map(tilt: float) -> np.ndarray:
+    """(R, Z, L) bool: where a hand can be that leans to the left of its finger axis by so much
+    (rad, not 0); L: the direction to which it leans."""
+    arm, found = panda(), False
+    lean = np.meshgrid(*(np.linspace(*ends) for ends in _LEAN_GRID), indexing="ij")[2].ravel()
+    fingers = math.copysign(1.0, tilt) * np.stack([np.sin(lean), -np.cos(lean), 0 * lean], axis=1)
+    for solved, frame in _leaning(abs(tilt)):
+        # What the last joint turns by from the frame in which it is 0 to the finger axis.
+        along, across = ((frame[:, :, i] * fingers).sum(axis=1) for i in (1, 0))
+        last = _wrapped(np.arctan2(-across, along) + math.pi / 4)
+        found |= solved & (abs(last) <= arm.upper[6] - 0.05)
+    return np.reshape(found, [count for _, _, count in _LEAN_GRID])
+
+
+@cache
+def _leaning(tilt: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """From each start: whether a hand that leans so far gets to each point of the grid, (N,) bool,
+    and its axes there with the last joint at 0, (N, 3, 3)."""
+    arm, found = panda(), []
+    grid = np.meshgrid(*(np.linspace(*ends) for ends in _LEAN_GRID), indexing="ij")
+    r, z, lean = (axis.ravel() for axis in grid)
+    target = np.stack([r, 0 * r, z], axis=1)
+    down = np.stack([-np.cos(lean), -np.sin(lean), 0 * lean], axis=1) * math.sin(tilt)
+    down -= [0.0, 0.0, math.cos(tilt)]
+    for start in _STARTS:
+        q, left = np.tile(start, (r.size, 1)), np.arange(r.size)
+        for _ in range(_ROUNDS):
+            _, error, jacobian = _lean_error(q[left], target[left], down[left])
+            square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-5 * np.eye(6)
+            step = jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, error[..., None])
+            moved = q[left] - np.clip(step[..., 0], -0.4, 0.4)
+            q[left] = np.clip(moved, arm.lower[:6], arm.upper[:6])
+            left = left[abs(error).max(axis=1) > 1e-6]
+        frame, error, _ = _lean_error(q, target, down)
+        solved = (abs(error).max(axis=1) < 1e-4) & (abs(q[:, 0]) <= ASIDE)
+        found.append((solved, frame))
+    return found
+
+
+def _lean_error(
+    q: np.ndarray, target: np.ndarray, down: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Axes of the hands (N, 3, 3), how far they are off the targets and off pointing `down`
+    (N, 6), and d/dq."""
+    frame, hand, axes, origins = _forward(q)
+    jacobian = np.empty((len(q), 6, 6))
+    for i in range(6):
+        jacobian[:, :3, i] = np.cross(axes[i], hand - origins[i])
+        jacobian[:, 3:, i] = np.cross(axes[i], frame[:, :, 2])
+    return frame, np.concatenate([hand - target, frame[:, :, 2] - down], axis=1), jacobian
+
+
 def _hand_error(q: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """How far the hands (N, 6) are off the targets and off pointing down (N, 5), and d/dq."""
+    frame, hand, axes, origins = _forward(q)
+    down = frame[:, :, 2]
+    # Twice the distance of `down` from straight down: its x and y vanish when it points up too.
+    tilt = down[:, :2] * (2.0 + down[:, 2:])
+    jacobian = np.empty((len(q), 5, 6))
+    for i in range(6):
+        jacobian[:, :3, i] = np.cross(axes[i], hand - origins[i])
+        turned = np.cross(axes[i], down)
+        jacobian[:, 3:, i] = turned[:, :2] * (2.0 + down[:, 2:]) + down[:, :2] * turned[:, 2:]
+    up = np.where(down[:, 2:] > 0, 1.0, 0.0)
+    return np.concatenate([hand - target, tilt + up], axis=1), jacobian
+
+
+def _forward(
+    q: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]:
+    """Axes (N, 3, 3) and origin (N, 3) of the last frame, its joint at 0, of configurations (N, 6);
+    axis and origin of every joint."""
     T = np.tile(np.eye(4), (len(q), 1, 1))
     axes, origins = [], []
     for i, (a, d, alpha) in enumerate(_LINKS):
@@ -201,39 +307,47 @@ def _hand_error(q: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarr
         T = T @ step
         axes.append(T[:, :3, 2])
         origins.append(T[:, :3, 3])
-    down, hand = axes[-1], origins[-1]
-    # Twice the distance of `down` from straight down: its x and y vanish when it points up too.
-    tilt = down[:, :2] * (2.0 + down[:, 2:])
-    jacobian = np.empty((len(q), 5, 6))
-    for i in range(6):
-        jacobian[:, :3, i] = np.cross(axes[i], hand - origins[i])
-        turned = np.cross(axes[i], down)
-        jacobian[:, 3:, i] = turned[:, :2] * (2.0 + down[:, 2:]) + down[:, :2] * turned[:, 2:]
-    up = np.where(down[:, 2:] > 0, 1.0, 0.0)
-    return np.concatenate([hand - target, tilt + up], axis=1), jacobian
+    return T[:, :3, :3], origins[-1], axes, origins
 
 
 def _reached(
-    scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, angle: np.ndarray
+    scene: Scene, x: np.ndarray, y: np.ndarray, tips: np.ndarray, angle: np.ndarray, tilt: float
 ) -> np.ndarray:
-    """Whether the downward hand can be at these places, and LIFT above them.
+    """Whether the tips of a hand can be at these places and heights, and LIFT above them.
 
-    angle: of the finger axis, rad; the two ways round are two angles.
+    angle: of the finger axis, rad; the two ways round are two angles. tilt: how far it leans to
+    the left of that, rad.
     """
-    base, found = scene.robot.base, reach_map()
-    dx, dy = x - base[0], y - base[1]
-    ahead = _wrapped(np.arctan2(dy, dx) - scene.robot.yaw)
-    last = _wrapped(ahead - (angle - scene.robot.yaw) - math.pi / 4)
-    good = np.abs(ahead) <= panda().upper[0] - 0.05
-    good &= np.abs(last) <= panda().upper[6] - 0.05
-    for height in (z - base[2], z - base[2] + LIFT):
-        cells = []
-        for value, (low, high, count) in zip((np.hypot(dx, dy), height), _GRID, strict=True):
-            cell = (value - low) / (high - low) * (count - 1)
-            good &= (cell >= 0) & (cell < count - 1)
-            cells.append(np.clip(np.floor(cell).astype(int), 0, count - 2))
-        i, j = cells  # all four corners of the cell, so that it is true in between
-        good &= found[i, j] & found[i + 1, j] & found[i, j + 1] & found[i + 1, j + 1]
+    base, yaw, length = scene.robot.base, scene.robot.yaw, panda().finger_tip
+    dx = x - base[0] - length * math.sin(tilt) * np.sin(angle)
+    dy = y - base[1] + length * math.sin(tilt) * np.cos(angle)
+    z = tips - base[2] + length * math.cos(tilt)
+    bearing = np.arctan2(dy, dx)
+    ahead, r = _wrapped(bearing - yaw), np.hypot(dx, dy)
+    if tilt == 0.0:
+        last = _wrapped(ahead - (angle - yaw) - math.pi / 4)
+        good = np.abs(ahead) <= panda().upper[0] - 0.05
+        good &= np.abs(last) <= panda().upper[6] - 0.05
+        for height in (z, z + LIFT):
+            good &= _all_around(reach_map(), _GRID, (r, height))
+        return good
+    lean = _wrapped(angle + math.copysign(math.pi / 2, tilt) - bearing)
+    good = np.abs(ahead) <= panda().upper[0] - ASIDE
+    for height in (z, z + LIFT):
+        good &= _all_around(lean_map(tilt), _LEAN_GRID, (r, height, lean))
+    return good
+
+
+def _all_around(found: np.ndarray, grid: tuple, values: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Whether all corners of the cell are true that these values lie in, so that it is so in
+    between."""
+    good, low_corner = np.ones(np.broadcast(*values).shape, dtype=bool), []
+    for value, (low, high, count) in zip(values, grid, strict=True):
+        cell = (value - low) / (high - low) * (count - 1)
+        good &= (cell >= 0) & (cell <= count - 1)
+        low_corner.append(np.clip(np.floor(cell).astype(int), 0, count - 2))
+    for corner in itertools.product((0, 1), repeat=len(values)):
+        good &= found[tuple(i + step for i, step in zip(low_corner, corner, strict=True))]
     return good
 
 
@@ -434,9 +548,9 @@ class _Exhaustion:
     def _reaches(self, box: Box, poses: np.ndarray, bottom: float, hold: Hold) -> np.ndarray:
         """Which depths are within reach at the poses of the box, (N, D) bool."""
         hand = _over(poses, hold)
-        z = bottom + box.size[2] - hold.depths + panda().finger_tip
-        x, y, angle, z = np.broadcast_arrays(hand[:, :1], hand[:, 1:2], hand[:, 2:], z[None, :])
-        return _reached(self.scene, x, y, z, angle)
+        tips = bottom + box.size[2] - hold.depths
+        x, y, tips, angle = np.broadcast_arrays(hand[:, :1], hand[:, 1:2], tips, hand[:, 2:])
+        return _reached(self.scene, x, y, tips, angle, hold.tilt)
 
     def _hit_by_box(self, box: Box, poses: np.ndarray, bottom: float) -> np.ndarray:
         """Who is in the way of a box that comes down there, (N,) sets."""
@@ -498,8 +612,8 @@ def _over(poses: np.ndarray, hold: Hold) -> np.ndarray:
 
 def _reached_by(scene: Scene, box: Box, poses: np.ndarray, bottom: float, way: _Way) -> np.ndarray:
     hand = _over(poses, way.hold)
-    z = bottom + box.size[2] - way.depth + panda().finger_tip
-    return _reached(scene, hand[:, 0], hand[:, 1], np.full(len(hand), z), hand[:, 2])
+    tips = np.full(len(hand), bottom + box.size[2] - way.depth)
+    return _reached(scene, hand[:, 0], hand[:, 1], tips, hand[:, 2], way.hold.tilt)
 
 
 def _hand_rows(box: Box, pose: np.ndarray, bottom: float, way: _Way) -> np.ndarray:
