@@ -13,13 +13,14 @@ from relevance.sampling.colors import draw_colors
 from relevance.sampling.looks import draw_camera, draw_light, draw_table
 from relevance.sampling.settings import SceneConfig
 from relevance.sampling.standing import Standing
-from relevance.scene import GAP, Box, Color, Scene
+from relevance.scene import Box, Color, Scene
 from relevance.scene.geometry import packed
 
-NEAR = 0.01
-"""Narrowest gap of a crowded box to its neighbour, m. A finger beside a box takes 34 mm with its
-clearance, so many boxes must leave before their neighbour can be taken from that side. At 26 mm
-10 to 11% of the same-plane queries are relevant, at 10 mm 13 to 14% (the paper's 14)."""
+GAPS = (0.005, 0.03)
+"""Narrowest and widest gap of a crowded box to its neighbour, m. A finger beside a box takes 28 to
+31 mm with its clearance, so most boxes must leave before their neighbour can be taken from that
+side. From 10 to 50 mm 11% of the same-plane queries are relevant, from 5 to 40 mm 12.7%, so 14.3%
+(the paper's 14)."""
 CENTRED = 0.1
 """How far off a neighbour's middle a crowded box may stand, as a share of its half extent."""
 OVER = {"on": 0.2, "stacks": 0.25}
@@ -156,7 +157,7 @@ def _beside(
     """A pose in one of the neighbour's four goal regions, its long edge across the way in.
 
     Near the region's middle and broadside on, it leaves no room beside it more often. The gap
-    is too narrow for another box, and wide enough for a finger in a part of the draws.
+    is too narrow for another box, and hardly ever wide enough for a finger.
     """
     quarter = int(rng.integers(4))
     axis = quarter % 2
@@ -165,7 +166,7 @@ def _beside(
     yaw = broadside + _within(-BROADSIDE, BROADSIDE, turn)  # to the robot's axes
     c, s = abs(math.cos(yaw)), abs(math.sin(yaw))
     extents = (c * size[0] + s * size[1]) / 2, (s * size[0] + c * size[1]) / 2
-    gap = max(config.spacing, _within(NEAR, GAP, deep))
+    gap = max(config.spacing, _within(*GAPS, deep))
     there = neighbour.extents_at(config.robot.yaw)
     along = there[axis] + extents[axis] + gap
     across = _within(-CENTRED, CENTRED, off) * there[1 - axis]

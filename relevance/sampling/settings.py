@@ -15,7 +15,7 @@ from relevance.sampling.colors import MOST
 from relevance.scene import FAMILIES, Camera, Light, Robot, Table, pinhole
 from relevance.scene.contacts import check_robot
 
-SAMPLER_VERSION = "2"
+SAMPLER_VERSION = "3"
 """Raised when equal settings and counters come to give another scene or other goals: a default,
 a draw or its order changed. Stored scenes keep the version that drew them."""
 
