@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from relevance.benchmarks import draw
+from relevance.benchmarks.reaching import reach_map
 from relevance.benchmarks.reference import (
     CLEARANCE,
     HELD,
@@ -14,7 +15,6 @@ from relevance.benchmarks.reference import (
     footprints_gap,
     holds,
     possible,
-    reach_map,
     shortest,
 )
 from relevance.planner import plan
