@@ -395,12 +395,14 @@ class _Search:
         return []
 
     def _sets(self, movable: list[str], required: frozenset[str]) -> list[Motion]:
-        """Breadth-first over sets of objects moved before the subject, grown by what could help."""
+        """Breadth-first over sets of objects moved before the subject. A set grows by what blocks
+        a pick that it needs, else by what takes room at the goal: every set that would do has one
+        of those besides."""
         subject, near = self.problem.goal.subject, self._beside_goal()
         rank = {name: i for i, name in enumerate(movable) if name != subject}
         frontier, rest = [frozenset[str]()], list[frozenset[str]]()
         for level in range(self.config.max_actions // 2):
-            found, tried = [], list[tuple[frozenset[str], bool]]()
+            found, tried = [], list[tuple[frozenset[str], frozenset[str], bool]]()
             if level == LOOK:
                 leaving = frozenset(self._leaving(list(rank)))
                 if not (required or self._works(leaving)):
@@ -410,19 +412,22 @@ class _Search:
                 rest = [chosen for chosen in rest if chosen <= leaving]
             for chosen in self._tiers(frontier, rest, found):
                 self._visit()
-                self.late = False
-                if required <= chosen:
+                self.late, open_picks = False, self._open_picks(chosen)
+                if required <= chosen and not open_picks:
                     motion = self._finish(chosen, self._orders(chosen))
                     if motion is not None:
                         found.append(motion)
                         if self.config.stop == "first":
                             return found
-                tried.append((chosen, self.late))
+                tried.append((chosen, open_picks, self.late))
             if found:
                 return found
             following, others = set(), set()
-            for chosen, late in tried:
-                helpful = near | self._in_the_way(chosen)
+            for chosen, open_picks, late in tried:
+                # Whatever else leaves, one of these is among it.
+                helpful = required - chosen or near
+                if open_picks:
+                    helpful = frozenset().union(*map(self.pose.in_the_way, open_picks))
                 following |= {chosen | {name} for name in helpful - chosen if name in rank}
                 if late:  # the others' leaving can make room for what is put aside
                     others |= {chosen | {name} for name in rank if name not in chosen}
@@ -467,11 +472,13 @@ class _Search:
             near.update(compress(problem.boxes, reaching_into(area, bottom, spread, boxes)))
         return frozenset(near) - {subject.name}
 
-    def _in_the_way(self, chosen: frozenset[str]) -> frozenset[str]:
-        """What blocks the picks that a set needs: the subject's by any grasp, and its own."""
-        goal = self.problem.goal
-        needed = [goal.subject, *(n for n in chosen if not self.pose.pickable(n, chosen))]
-        return frozenset().union(*map(self.pose.in_the_way, needed)) - {goal.subject}
+    def _open_picks(self, chosen: frozenset[str]) -> frozenset[str]:
+        """What of a set, or else the subject, cannot be picked before others have left, too."""
+        stays = chosen.difference(self._leaving(sorted(chosen)))
+        subject = self.problem.goal.subject
+        if stays or self.pose.pickable(subject, chosen):
+            return stays
+        return frozenset({subject})
 
     def _orders(self, chosen: frozenset[str]) -> Iterator[tuple[str, ...]]:
         """The orders in which a set can be picked; scores have no say in it."""
