@@ -82,7 +82,7 @@ class PoseBound:
         self._blocked: dict[tuple[str, Callable[[Box], Family]], _Blocked] = {}
         self._close: dict[str, tuple[set[frozenset[str]], set[frozenset[str]]]] = {}
         """For objects about whose pick less than CLOSE may decide: who is in the way of each grasp
-        with that much more room asked for, and less."""
+        with that much more room and reach asked for, and less."""
         self._goal_poses: dict[tuple, Placement | None] = {}
         self._held: dict[tuple[tuple[Grasp, ...], float], tuple] = {}
         self._intervals: dict[float, tuple[float, float]] = {}
@@ -226,37 +226,38 @@ class PoseBound:
         problem = self.problem
         problem.counts.pose += 1
         i, count = problem.index[name], len(problem.boxes)
-        reached = self._reached(problem.boxes[name], family)
-        if not any(reached):
+        spare = self._spare_reach(problem.boxes[name], family)
+        if not (spare >= -CLOSE).any():
             return _Blocked(family, [None] * len(family), frozenset())
         blocking = np.zeros((len(family), count), np.bool_)
         boxes, names, seen = problem.obstacles[:count], list(problem.boxes), {}
 
-        def blockers(room: float) -> tuple[list[frozenset[str] | None], float]:
+        def blockers(ease: float) -> tuple[list[frozenset[str] | None], float]:
+            room = PICK_MARGIN - ease
             close = pick_blockers(i, family.axes, family.parts, boxes, room, blocking)
             who = list[frozenset[str] | None]()
-            for g, within in enumerate(reached):
+            for g, within in enumerate((spare >= -ease).tolist()):
                 bits = blocking[g].tobytes()
                 if within and bits not in seen:
                     seen[bits] = frozenset(compress(names, blocking[g].tolist()))
                 who.append(seen[bits] if within else None)
             return who, close
 
-        who, close = blockers(PICK_MARGIN)
+        who, close = blockers(0.0)
         sets = frozenset(one for one in who if one is not None)
-        if close < CLOSE or name in self._close:
+        if min(close, abs(spare).min()) < CLOSE or name in self._close:
             before = set[frozenset[str]]().union(
                 *(some.sets for (other, _), some in self._blocked.items() if other == name)
             )
             more, less = self._close.setdefault(name, (before, set(before)))
-            more.update(one for one in blockers(PICK_MARGIN + CLOSE)[0] if one is not None)
-            less.update(one for one in blockers(PICK_MARGIN - CLOSE)[0] if one is not None)
+            more.update(one for one in blockers(-CLOSE)[0] if one is not None)
+            less.update(one for one in blockers(CLOSE)[0] if one is not None)
         return _Blocked(family, who, sets)
 
-    def _reached(self, box: Box, family: Family) -> list[bool]:
-        """Which grasps are within reach where the box stands."""
+    def _spare_reach(self, box: Box, family: Family) -> np.ndarray:
+        """By how much each grasp is within reach where the box stands, (G,), m."""
         if not len(family):
-            return []
+            return np.empty(0)
         x, y, _ = self.problem.scene.robot.base
         angles, left = box.yaw + family.axes * (math.pi / 2), family.wrists[:, 0]
         r = np.hypot(
@@ -264,8 +265,7 @@ class PoseBound:
         )
         heights = (box.bottom + box.size[2] / 2 + family.wrists[:, 1]).tolist()
         near, far = np.array([self._interval(height) for height in heights]).T
-        self.problem.undecided |= bool(np.minimum(abs(r - near), abs(r - far)).min() < CLOSE)
-        return ((near <= r) & (r <= far)).tolist()
+        return np.minimum(r - near, far - r)
 
     def _find(
         self,
