@@ -6,7 +6,6 @@ Panda's published parameters, on grids.
 
 from __future__ import annotations
 
-import itertools
 import math
 from functools import cache
 
@@ -153,7 +152,8 @@ def _forward(
 def reached(
     scene: Scene, x: np.ndarray, y: np.ndarray, tips: np.ndarray, angle: np.ndarray, tilt: float
 ) -> np.ndarray:
-    """Whether the tips of a hand can be at these places and heights, and LIFT above them.
+    """Whether the tips of a hand can be at these places and heights, and LIFT above them; arrays
+    that broadcast.
 
     angle: of the finger axis, rad; the two ways round are two angles. tilt: how far it leans to
     the left of that, rad.
@@ -162,33 +162,35 @@ def reached(
     dx = x - base[0] - length * math.sin(tilt) * np.sin(angle)
     dy = y - base[1] + length * math.sin(tilt) * np.cos(angle)
     z = tips - base[2] + length * math.cos(tilt)
-    bearing = np.arctan2(dy, dx)
-    ahead, r = _wrapped(bearing - yaw), np.hypot(dx, dy)
+    bearing, r = np.arctan2(dy, dx), np.hypot(dx, dy)
+    ahead, limits = abs(_wrapped(bearing - yaw)), panda().upper
     if tilt == 0.0:
-        last = _wrapped(ahead - (angle - yaw) - math.pi / 4)
-        good = np.abs(ahead) <= panda().upper[0] - 0.05
-        good &= np.abs(last) <= panda().upper[6] - 0.05
-        for height in (z, z + LIFT):
-            good &= _all_around(reach_map(), _GRID, (r, height))
-        return good
-    lean = _wrapped(angle + math.copysign(math.pi / 2, tilt) - bearing)
-    good = np.abs(ahead) <= panda().upper[0] - ASIDE
+        last = _wrapped(bearing - angle - math.pi / 4)
+        good = (ahead <= limits[0] - 0.05) & (abs(last) <= limits[6] - 0.05)
+        grid, more = _GRID, ()
+    else:
+        lean = _wrapped(angle + math.copysign(math.pi / 2, tilt) - bearing)
+        good = ahead <= limits[0] - ASIDE
+        grid, more = _LEAN_GRID, (lean,)
     for height in (z, z + LIFT):
-        good &= _all_around(lean_map(tilt), _LEAN_GRID, (r, height, lean))
+        cells = []
+        for value, (low, high, count) in zip((r, height, *more), grid, strict=True):
+            cell = np.floor((value - low) / (high - low) * (count - 1)).astype(int)
+            good = good & (cell >= 0) & (cell < count - 1)
+            cells.append(np.clip(cell, 0, count - 2))
+        good = good & _cells(tilt)[tuple(cells)]
     return good
 
 
-def _all_around(found: np.ndarray, grid: tuple, values: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Whether all corners of the cell are true that these values lie in, so that it is so in
+@cache
+def _cells(tilt: float) -> np.ndarray:
+    """The cells of the map for this lean of whose corners all are true, so that it is so in
     between."""
-    good, low_corner = np.ones(np.broadcast(*values).shape, dtype=bool), []
-    for value, (low, high, count) in zip(values, grid, strict=True):
-        cell = (value - low) / (high - low) * (count - 1)
-        good &= (cell >= 0) & (cell <= count - 1)
-        low_corner.append(np.clip(np.floor(cell).astype(int), 0, count - 2))
-    for corner in itertools.product((0, 1), repeat=len(values)):
-        good &= found[tuple(i + step for i, step in zip(low_corner, corner, strict=True))]
-    return good
+    found = lean_map(tilt) if tilt else reach_map()
+    for axis in range(found.ndim):
+        ends = np.moveaxis(found, axis, 0)
+        found = np.moveaxis(ends[:-1] & ends[1:], 0, axis)
+    return found
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:

@@ -368,8 +368,7 @@ class _Exhaustion:
         """Which depths are within reach at the poses of the box, (N, D) bool."""
         hand = _over(poses, hold)
         tips = bottom + box.size[2] - hold.depths
-        x, y, tips, angle = np.broadcast_arrays(hand[:, :1], hand[:, 1:2], tips, hand[:, 2:])
-        return reached(self.scene, x, y, tips, angle, hold.tilt)
+        return reached(self.scene, hand[:, :1], hand[:, 1:2], tips, hand[:, 2:], hold.tilt)
 
     def _hit_by_box(self, box: Box, poses: np.ndarray, bottom: float) -> np.ndarray:
         """Who is in the way of a box that comes down there, (N,) sets."""
