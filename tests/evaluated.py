@@ -19,7 +19,7 @@ from relevance.sampling import SceneConfig
 from relevance.training import TrainConfig, train
 
 DATA = DatasetConfig(
-    seed=5,
+    seed=6,
     train=Counts(same_plane=2, on=2),
     validation=Counts(same_plane=1, on=1),
     test=Counts(same_plane=3, on=3),

@@ -21,7 +21,7 @@ import numba
 import numpy as np
 from numba.core import config
 
-from relevance.planner.grasps import bodies, grasps, pick_target
+from relevance.planner.grasps import bodies, grasps, leaning_grasps, pick_target
 from relevance.planner.kernels.kinematics import TARGET, functions
 from relevance.planner.kernels.motions import ROWS, VERTICAL, motion, retreat
 from relevance.planner.keyframes import KeyframeBound
@@ -71,12 +71,12 @@ def first_half() -> None:
 
 
 def other_half() -> None:
-    """Compile the retreat of the path bound, then the keyframe bound."""
+    """Compile the retreat of the path bound, then the keyframe bound, with a hand that leans."""
     problem = _problem()
     grasp, place = grasps(problem.subject)[0], problem.reference.position
     rows = np.tile(HOME, (2 * VERTICAL + 1, 1))
     retreat(rows, problem.arm, np.zeros(TARGET), bodies(grasp.opening), problem.obstacles)
-    there = Placement(grasp=grasp, pose=(*place[:2], 0.0))
+    there = Placement(grasp=leaning_grasps(problem.subject)[0], pose=(*place[:2], 0.0))
     KeyframeBound(PoseBound(problem)).solve((problem.goal.subject,), [there])
 
 

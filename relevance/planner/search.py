@@ -21,7 +21,7 @@ from itertools import compress, islice
 
 from relevance.planner import logic
 from relevance.planner.checking import broken
-from relevance.planner.compiling import compile_once
+from relevance.planner.compiling import compile_once, other_half
 from relevance.planner.grasps import fits, grasps
 from relevance.planner.guides import Guide, ask, rounds
 from relevance.planner.kernels.planar import reaching_into
@@ -163,6 +163,7 @@ def _one_of_each() -> None:
     )
     for goal in ("on(a, b)", "on-the-left(b, a)", "in-front(f, a)"):
         _plan(scene, scene.goal(goal), PlannerConfig(), None, None)
+    other_half()
 
 
 class _Bounds:
