@@ -237,10 +237,15 @@ def _work(
 
 def hand_over(measured: Any, folder: Path) -> None:
     """Print a part's tables; write its rows and its plots."""
-    from relevance.benchmarks import save
-
     for table in measured.tables:
         show(table.columns, table.rows, "table", title=table.title)
+    write(measured, folder)
+
+
+def write(measured: Any, folder: Path) -> None:
+    """Write a part's rows and its plots."""
+    from relevance.benchmarks import save
+
     records = measured.records()
     with (folder / f"{measured.name}.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(records[0]), lineterminator="\n")

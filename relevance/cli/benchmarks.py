@@ -11,13 +11,15 @@ from typing import Annotated, Literal
 import tyro
 
 from relevance.cli.arguments import Command, Preset, at_least, one_of
-from relevance.cli.bench import bench_planner, hand_over
+from relevance.cli.bench import bench_planner, hand_over, write
 from relevance.cli.terminal import bar, say
 
 Part = Literal["making", "reading", "queries", "crashes"]
 PARTS: tuple[Part, ...] = ("making", "reading", "queries", "crashes")
 OptionalSeed = Annotated[int | None, tyro.conf.arg(metavar="N")]
 Bodies = Annotated[tuple[str, ...], tyro.conf.arg(metavar="BODY")]
+Recipes = Annotated[tuple[str, ...], tyro.conf.arg(metavar="RECIPE")]
+Seeds = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N")]
 OptionalFolder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")]
 
 
@@ -95,6 +97,10 @@ def _training(_: Preset) -> Callable[..., int]:
         seconds: float = 2.0,
         device: str = TrainConfig().device,
         bfloat16: Literal["auto", "on", "off"] = TrainConfig().bfloat16,
+        dataset: OptionalFolder = None,
+        recipes: Recipes = ("fair", "paper"),
+        minutes: float = 10.0,
+        seeds: Seeds = (0,),
         out: OptionalFolder = None,
     ) -> int:
         """Measure how fast every body trains and looks, on made-up pictures.
@@ -102,6 +108,12 @@ def _training(_: Preset) -> Callable[..., int]:
         Queries a second are given twice: with one encoding of a scene for all its goals where
         the body can share it, and with an encoding for every query, as in the paper. On a CPU
         times are those of one core.
+
+        With --dataset: how much every body learns in equal time of one core, of sizes that it can
+        train, by each recipe; the paper's shares the time between a network for each family. A
+        few steps say how many fit. Time is the processor's, of all steps and of reading for them;
+        what is before and after them (validation) is not in it. Checkpoints stay in the dataset:
+        what is there already is not trained again, and a killed run goes on.
 
         Args:
             sizes: Widths that a CPU can train, the paper's, or both.
@@ -113,8 +125,14 @@ def _training(_: Preset) -> Callable[..., int]:
             seconds: How long each of a body's three measurements goes on.
             device: Where; auto is the accelerator if there is one.
             bfloat16: As of `relevance train`.
+            dataset: A labelled dataset to learn from, on the CPU.
+            recipes: With --dataset: fair, paper, fair-no-goal-objects (subject and reference are
+                left out of the loss), fair-soft-labels.
+            minutes: With --dataset: time of one core for each body and recipe.
+            seeds: With --dataset: of weights and order.
             out: Folder for the table's rows as CSV; data/bench/training when not given.
         """
+        from relevance.benchmarks.learning import RECIPES, learned, learning_runs
         from relevance.benchmarks.training import measure_training
         from relevance.models import BODIES, unequal
 
@@ -122,10 +140,33 @@ def _training(_: Preset) -> Callable[..., int]:
             at_least(f"--{flag}", count, 1)
         at_least("--objects", objects, 3)
         at_least("--seconds", seconds, 0)
+        at_least("--minutes", minutes, 0)
+        for seed in seeds:
+            at_least("--seeds", seed, 0, 2**31)
         for body in bodies:
             one_of("--bodies", body, BODIES)
+        for recipe in recipes:
+            one_of("--recipes", recipe, RECIPES)
         folder = out or Path("data/bench/training")
         folder.mkdir(parents=True, exist_ok=True)
+        if dataset:
+            rows = []
+            for name, run in learning_runs(
+                dataset,
+                bodies=bodies,
+                recipes=recipes,
+                seeds=seeds,
+                minutes=minutes,
+                seconds=seconds,
+                folder=folder,
+            ):
+                with bar(name) as progress:
+                    rows += run(progress)
+                write(learned(rows, minutes), folder)
+            hand_over(learned(rows, minutes), folder)
+            for line in unequal(bodies or BODIES):
+                print(line)
+            return 0
         with bar("bodies") as progress:
             measured = measure_training(
                 TrainConfig(device=device, bfloat16=bfloat16),
@@ -167,10 +208,11 @@ COMMANDS = {
     ),
     "bench training": Command(
         make=_training,
-        about="how fast every body trains and looks",
+        about="how fast every body trains and looks, how much it learns in equal time",
         examples=(
             "relevance bench training",
             "relevance bench training --sizes paper --device cuda --scenes 16 --seconds 20",
+            "relevance bench training --dataset data/demo --minutes 10",
         ),
     ),
 }

@@ -59,6 +59,11 @@ class ModelConfig:
         return cls()
 
     @classmethod
+    def bare(cls) -> Self:
+        """Sizes that a CPU can train; else what the paper has."""
+        return cls()
+
+    @classmethod
     def paper(cls) -> Self:
         """The paper's sizes; the defaults for a body that the paper does not have."""
         return cls()

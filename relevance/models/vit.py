@@ -77,6 +77,11 @@ class VitConfig(ModelConfig):
         return cls(stem=True, taught=True)
 
     @classmethod
+    def bare(cls) -> Self:
+        """Sizes that a CPU can train; the paper's attention."""
+        return cls(attention="trio")
+
+    @classmethod
     def paper(cls) -> Self:
         """The paper's width of 768; depth and heads, which it does not say, as ViT-B."""
         return cls(width=768, heads=12, layers=12, attention="trio")

@@ -13,6 +13,7 @@ What is unusual here:
   `on-the-left` and `on-the-right`, and exchanging colour channels changes no geometry.
 """
 
+from relevance.training.budget import one_core, steps_within
 from relevance.training.catalogue import Catalogue
 from relevance.training.checkpoints import (
     CHECKPOINT_VERSION,
@@ -60,12 +61,14 @@ __all__ = [
     "measure",
     "measure_speed",
     "newest_checkpoint",
+    "one_core",
     "pick_device",
     "polling",
     "relevance_loss",
     "save_checkpoint",
     "ship",
     "shipped",
+    "steps_within",
     "train",
     "use_bfloat16",
     "write_row",

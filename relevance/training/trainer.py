@@ -66,6 +66,8 @@ class Trainer:
         """Wall time of those steps and of waiting for them, over all the runs that took them."""
         self.waited = 0.0
         """Seconds of it that were spent waiting for data."""
+        self.core_seconds = 0.0
+        """Processor time of this process in them; all of it where no other one reads ahead."""
         self.history: list[dict[str, float]] = []
         """Loss and its parts, averaged between two entries; each with its step."""
         self._sums: dict[str, float] = {}
@@ -103,12 +105,13 @@ class Trainer:
 
     def take(self, steps: Iterator[list[Batch]]) -> dict[str, float]:
         """One step on what comes next, and how long that took to come."""
-        start = time.perf_counter()
+        start, began = time.perf_counter(), time.process_time()
         batches = next(steps)
         waited = time.perf_counter() - start
         found = self.step(batches)
         self.waited += waited
         self.seconds += time.perf_counter() - start
+        self.core_seconds += time.process_time() - began
         return found
 
     def step(self, batches: Sequence[Batch]) -> dict[str, float]:
@@ -157,6 +160,7 @@ class Trainer:
             "done": self.done,
             "seconds": self.seconds,
             "waited": self.waited,
+            "core_seconds": self.core_seconds,
             "history": self.history,
             "sums": self._sums,
             "model": self.model.state_dict(),
@@ -168,6 +172,7 @@ class Trainer:
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.done, self.seconds, self.waited = (state[k] for k in ("done", "seconds", "waited"))
+        self.core_seconds = state["core_seconds"]
         self.history, self._sums = list(state["history"]), dict(state["sums"])
 
 
@@ -218,10 +223,10 @@ def train(
     start, before = _start(dataset, config, catalogue)
     own = replace(config, model=start.config) if start else config
     run = _Run(folder=folder, settings=f"{own.model.body}-{config.content_hash}", data=data)
-    with _threads(config.threads), together() as ranks:
+    with on_threads(config.threads), together() as ranks:
         trainer = Trainer(own, catalogue.predicates, start, ranks)
         run.resume(trainer)
-        with closing(_reader(catalogue, trainer).steps(trainer.done)) as steps:
+        with closing(reader_for(catalogue, trainer).steps(trainer.done)) as steps:
             while trainer.done < config.steps:
                 try:
                     trainer.take(steps)
@@ -234,7 +239,7 @@ def train(
                     run.save(trainer)
         if ranks.first:
             validation = Catalogue.of(dataset, "validation", config)
-            metrics = measure(trainer.model, _reader(validation, trainer).whole())
+            metrics = measure(trainer.model, reader_for(validation, trainer).whole())
             meta = {
                 "checkpoint_id": name,
                 "config": own.to_dict(),
@@ -243,6 +248,7 @@ def train(
                 "created": datetime.now(UTC).isoformat(),
                 "train_seconds": trainer.seconds,
                 "wait_seconds": trainer.waited,
+                "core_seconds": trainer.core_seconds,
                 "bfloat16": trainer.bfloat16,
                 "parameters": sum(p.numel() for p in trainer.model.parameters()),
                 "metrics": metrics,
@@ -322,7 +328,7 @@ def _start(
     return model, meta.get("offsets", {})
 
 
-def _reader(catalogue: Catalogue, trainer: Trainer) -> Reader:
+def reader_for(catalogue: Catalogue, trainer: Trainer) -> Reader:
     """What reads for a trainer; a network that is told where objects are needs no pictures."""
     ahead = trainer.config.workers
     if ahead is None:
@@ -340,7 +346,8 @@ def _reader(catalogue: Catalogue, trainer: Trainer) -> Reader:
 
 
 @contextmanager
-def _threads(count: int) -> Iterator[None]:
+def on_threads(count: int) -> Iterator[None]:
+    """So many threads of the processor; torch's choice for 0."""
     before = torch.get_num_threads()
     torch.set_num_threads(count or before)
     try:
@@ -352,9 +359,11 @@ def _threads(count: int) -> Iterator[None]:
 # --- metrics ------------------------------------------------------------------------------
 
 
-def measure(model: RelevanceModel, batches: Iterable[Batch]) -> dict[str, Any]:
-    """Metrics per predicate on all goals of the batches, of the network's own scores (no offset
-    added); see `accuracy`.
+def measure(
+    model: RelevanceModel, batches: Iterable[Batch], offsets: Mapping[str, float] = {}
+) -> dict[str, Any]:
+    """Metrics per predicate on all goals of the batches, of the network's own scores and the
+    offsets of predicates that have one; see `accuracy`.
 
     `queries` leaves subject and reference out, `with_goal_objects` has them. `same-plane` pools
     its four predicates; what a predicate is asked in another family than its own stands under
@@ -370,6 +379,7 @@ def measure(model: RelevanceModel, batches: Iterable[Batch]) -> dict[str, Any]:
                 if predicate.name not in model.predicates:
                     continue
                 score = model.decode(encoding, predicate, goals, labelled)
+                score = score + offsets.get(predicate.name, 0.0)
                 places = torch.arange(score.shape[-1], device=score.device)
                 asked = places[:, None] != goals[..., None, :]
                 arrays = (score, relevant.bool(), labelled, asked.all(-1))
