@@ -103,7 +103,7 @@ class Family:
         return (self[number] for number in range(len(self)))
 
 
-_SHARES = (0.0, 0.5, -0.5, 1.0, -1.0)
+_SHARES = (0.0, 1 / 3, -1 / 3, 2 / 3, -2 / 3, 1.0, -1.0)
 _DEEP, _OTHERS, _LEANING = (
     np.array(list(ways), float)
     for ways in (

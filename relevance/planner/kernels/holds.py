@@ -19,9 +19,9 @@ GRIP = 0.005
 """Least height of the pads that lies on the face of a held box, m."""
 GROUND = 0.004
 """What the finger tips keep from what the box stands on, m."""
-INSET = 0.01
+INSET = 0.005
 """Least distance of the pads' middle line from the corner of a held box, m."""
-FARTHEST = 0.04
+FARTHEST = 0.055
 """Farthest that the hand is shifted along a box, m."""
 SPREAD = 0.002
 """How far each finger stands off the box before it closes, m."""
@@ -60,7 +60,7 @@ def sound_holds(size, ways, hand, over, tip, opening, flange, axes, rows, parts)
         most = min(edge - INSET, FARTHEST)
         for w in range(len(ways)):
             which, level = int(ways[w, 0]), int(ways[w, 2])
-            if ways[w, 1] != 0.0 and most <= INSET / 2:
+            if ways[w, 1] != 0.0 and most <= INSET:
                 continue
             shift, tilt = ways[w, 1] * max(most, 0.0), TILTS[which]
             s, c = math.sin(tilt), math.cos(tilt)
