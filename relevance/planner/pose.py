@@ -157,22 +157,25 @@ class PoseBound:
         choices = self.choices(subject.name, taken)
         areas = tuple(enumerate(problem.goal_regions(reference)))
         for choice, (number, area) in ((choice, area) for choice in choices for area in areas):
-            key = (gone, choice, reference.position, reference.yaw, number)
-            if key not in self._goal_poses:
-                bottom = reference.top if problem.goal.predicate.stacked else 0.0
-                if standing is None:
-                    standing = problem.standing(gone | {subject.name, reference.name})
-                    standing = np.vstack([standing, obstacle(reference)])
-                where = area, bottom, subject, standing
-                found = None
-                if choice[0] in deep or self._roomy((gone, *key[2:]), *where):
-                    found = self._find(area, area[:2], bottom, subject, choice, standing)
-                self._goal_poses[key] = found
-            found = self._goal_poses[key]
-            if found is not None:
-                yield found
+            while choice:
+                key = (gone, choice, reference.position, reference.yaw, number)
+                if key not in self._goal_poses:
+                    bottom = reference.top if problem.goal.predicate.stacked else 0.0
+                    if standing is None:
+                        standing = problem.standing(gone | {subject.name, reference.name})
+                        standing = np.vstack([standing, obstacle(reference)])
+                    where = area, bottom, subject, standing
+                    found = None
+                    if choice[0] in deep or self._roomy((gone, *key[2:]), *where):
+                        found = self._find(area, area[:2], bottom, subject, choice, standing)
+                    self._goal_poses[key] = found
+                found = self._goal_poses[key]
+                if found is None:
+                    break
+                yield found  # and should a later bound refuse it, without that side
+                choice = tuple(g for g in choice if _side(g) != _side(found.grasp))
 
-    def place_all(self, order: tuple[str, ...], tries: int = 3) -> Iterator[list[Placement]]:
+    def place_all(self, order: tuple[str, ...], tries: int = 6) -> Iterator[list[Placement]]:
         """Poses for every moved box: first the subject's, then the others' around it.
 
         Placing the subject first loses fewer tasks than placing greedily in time order.
