@@ -107,7 +107,7 @@ def test_a_decision_that_a_tenth_of_a_millimetre_turns_is_flagged():
     """A neighbour that leaves the finger just enough room, or just not."""
 
     def beside(gap):
-        red = box("red", 0.0, 0.25, RED, size=(0.11, 0.05, 0.06))  # one grasp: fingers along y
+        red = box("red", 0.0, 0.25, RED, size=(0.09, 0.05, 0.06))  # one grasp: fingers along y
         green = box("green", 0.0, 0.30 + gap, GREEN, size=(0.068, 0.05, 0.06))
         result = plan(replace(OPEN, objects=(red, green, OPEN["blue"])), "on-the-right(red, blue)")
         assert result.status == "solved"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress, islice
+from itertools import chain, compress, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -156,26 +156,29 @@ class PoseBound:
         taken = frozenset(problem.boxes) if everywhere else gone
         choices = self.choices(subject.name, taken)
         areas = tuple(enumerate(problem.goal_regions(reference)))
-        for choice, (number, area) in ((choice, area) for choice in choices for area in areas):
-            while choice:
-                key = (gone, choice, reference.position, reference.yaw, number)
-                if key not in self._goal_poses:
-                    bottom = reference.top if problem.goal.predicate.stacked else 0.0
-                    if standing is None:
-                        standing = problem.standing(gone | {subject.name, reference.name})
-                        standing = np.vstack([standing, obstacle(reference)])
-                    where = area, bottom, subject, standing
-                    found = None
-                    if choice[0] in deep or self._roomy((gone, *key[2:]), *where):
-                        found = self._find(area, area[:2], bottom, subject, choice, standing)
-                    self._goal_poses[key] = found
-                found = self._goal_poses[key]
-                if found is None:
-                    break
-                yield found  # and should a later bound refuse it, without that side
-                choice = tuple(g for g in choice if _side(g) != _side(found.grasp))
+        once = ((choice, *area) for choice in choices for area in areas)
+        again = list[tuple]()
+        for choice, number, area in chain(once, again):
+            key = (gone, choice, reference.position, reference.yaw, number)
+            if key not in self._goal_poses:
+                bottom = reference.top if problem.goal.predicate.stacked else 0.0
+                if standing is None:
+                    standing = problem.standing(gone | {subject.name, reference.name})
+                    standing = np.vstack([standing, obstacle(reference)])
+                where = area, bottom, subject, standing
+                found = None
+                if choice[0] in deep or self._roomy((gone, *key[2:]), *where):
+                    found = self._find(area, area[:2], bottom, subject, choice, standing)
+                self._goal_poses[key] = found
+            found = self._goal_poses[key]
+            if found is not None:
+                yield found
+                # Should later bounds refuse all of these, there are the other sides.
+                side = _side(found.grasp)
+                if rest := tuple(grasp for grasp in choice if _side(grasp) != side):
+                    again.append((rest, number, area))
 
-    def place_all(self, order: tuple[str, ...], tries: int = 6) -> Iterator[list[Placement]]:
+    def place_all(self, order: tuple[str, ...], tries: int = 8) -> Iterator[list[Placement]]:
         """Poses for every moved box: first the subject's, then the others' around it.
 
         Placing the subject first loses fewer tasks than placing greedily in time order.
