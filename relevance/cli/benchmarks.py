@@ -163,22 +163,20 @@ def _training(_: Preset) -> Callable[..., int]:
                 with bar(name) as progress:
                     rows += run(progress)
                 write(learned(rows, minutes), folder)
-            hand_over(learned(rows, minutes), folder)
-            for line in unequal(bodies or BODIES):
-                print(line)
-            return 0
-        with bar("bodies") as progress:
-            measured = measure_training(
-                TrainConfig(device=device, bfloat16=bfloat16),
-                sizes=sizes,
-                bodies=bodies,
-                scenes=scenes,
-                goals=goals,
-                objects=objects,
-                queries=queries,
-                seconds=seconds,
-                progress=progress,
-            )
+            measured = learned(rows, minutes)
+        else:
+            with bar("bodies") as progress:
+                measured = measure_training(
+                    TrainConfig(device=device, bfloat16=bfloat16),
+                    sizes=sizes,
+                    bodies=bodies,
+                    scenes=scenes,
+                    goals=goals,
+                    objects=objects,
+                    queries=queries,
+                    seconds=seconds,
+                    progress=progress,
+                )
         hand_over(measured, folder)
         for line in unequal(bodies or BODIES):
             print(line)

@@ -104,7 +104,7 @@ class Family:
 
 
 _SHARES = (0.0, 1 / 3, -1 / 3, 2 / 3, -2 / 3, 1.0, -1.0)
-_DEEP, _OTHERS, _LEANING = (
+_WAYS = tuple(
     np.array(list(ways), float)
     for ways in (
         [(0, 0.0, 0)],
@@ -112,7 +112,7 @@ _DEEP, _OTHERS, _LEANING = (
         product(range(1, len(TILTS)), _SHARES, (0, 1)),
     )
 )
-"""What the families choose from, as `sound_holds` has it."""
+"""What the deep, the other and the leaning grasps are chosen from, as `sound_holds` has it."""
 
 
 def grasps(box: Box) -> tuple[Grasp, ...]:
@@ -122,36 +122,23 @@ def grasps(box: Box) -> tuple[Grasp, ...]:
 
 def deep_grasps(box: Box) -> Family:
     """The same side by side."""
-    return _deep(box.size)
+    return _family(box.size, 0)
 
 
 def other_grasps(box: Box) -> Family:
     """The shallower and shifted grasps, edge by edge, each shift from deep to shallow."""
-    return _others(box.size)
+    return _family(box.size, 1)
 
 
 def leaning_grasps(box: Box) -> Family:
     """The grasps of a hand that leans, edge by edge, each tilt and shift from deep to shallow."""
-    return _leaning(box.size)
+    return _family(box.size, 2)
 
 
 @lru_cache(maxsize=1024)
-def _deep(size: tuple[float, float, float]) -> Family:
-    return _family(size, _DEEP)
-
-
-@lru_cache(maxsize=1024)
-def _others(size: tuple[float, float, float]) -> Family:
-    return _family(size, _OTHERS)
-
-
-@lru_cache(maxsize=128)
-def _leaning(size: tuple[float, float, float]) -> Family:
-    return _family(size, _LEANING)
-
-
-def _family(size: tuple[float, float, float], ways: np.ndarray) -> Family:
-    hand, most = _hand(), 2 * len(ways)
+def _family(size: tuple[float, float, float], number: int) -> Family:
+    hand, ways = _hand(), _WAYS[number]
+    most = 2 * len(ways)
     axes, rows = np.empty(most, np.int64), np.empty((most, COLUMNS))
     parts = np.empty((most, 1 + len(hand.shape), 5))
     count = sound_holds(
