@@ -110,14 +110,14 @@ def panda() -> Panda:
     mount = _numbers(joints["panda_leftfinger"], "xyz")
     finger = _vertices(meshes / "finger.obj") + mount
     middle = 0.5 * (finger[:, 2].min() + finger[:, 2].max())
-    bounds = np.array(limits)
+    lower, upper, velocity = np.array(limits).T.copy()  # contiguous: a kernel for each layout else
     opening = joints["panda_leftfinger"].find("limit")
     assert opening is not None
     return Panda(
         chain=tuple(chain),
-        lower=bounds[:, 0],
-        upper=bounds[:, 1],
-        velocity=bounds[:, 2],
+        lower=lower,
+        upper=upper,
+        velocity=velocity,
         arm=arm,
         upper_arm=tuple(
             (len(LINKS) + i, *_box(_vertices(meshes / f"{name.removeprefix('panda_')}.obj")))

@@ -1,8 +1,8 @@
 """First use: the kernels are compiled by two processes at once, and by one caller at a time.
 
 One half is compiled here, the other by a child. What both need, each finds in the cache when the
-other was first, so they begin at different ends: the child with the retreat, whose kernels the
-motions need last.
+other was first, so they begin at different ends: the child with the pose bound, which looks at no
+distances in space, then with the retreat, whose kernels the motions need last.
 """
 
 from __future__ import annotations
@@ -61,23 +61,24 @@ def compile_once(rest: Callable[[], None]) -> None:
 
 
 def first_half() -> None:
-    """Compile the motions of the path bound, then the pose bound."""
+    """Compile the motions of the path bound."""
     problem = _problem()
     grasp = grasps(problem.subject)[0]
     target, hand = pick_target(problem.subject, grasp), bodies(grasp.opening)
     rows = np.tile(HOME, (ROWS + 1, 1))
     motion(rows, problem.arm, np.zeros(TARGET), False, target, hand, problem.obstacles)
-    next(PoseBound(problem).place_all((problem.goal.subject,)), None)
 
 
 def other_half() -> None:
-    """Compile the retreat of the path bound, then the keyframe bound, with a hand that leans."""
+    """Compile the pose bound, the path bound's retreat, the keyframe bound with a leaning hand."""
     problem = _problem()
+    pose_bound = PoseBound(problem)
+    next(pose_bound.place_all((problem.goal.subject,)), None)
     grasp, place = grasps(problem.subject)[0], problem.reference.position
     rows = np.tile(HOME, (2 * VERTICAL + 1, 1))
     retreat(rows, problem.arm, np.zeros(TARGET), bodies(grasp.opening), problem.obstacles)
     there = Placement(grasp=leaning_grasps(problem.subject)[0], pose=(*place[:2], 0.0))
-    KeyframeBound(PoseBound(problem)).solve((problem.goal.subject,), [there])
+    KeyframeBound(pose_bound).solve((problem.goal.subject,), [there])
 
 
 def _problem() -> Problem:
