@@ -45,6 +45,9 @@ REACH_MARGIN = 0.004
 """Distance kept from the ends of the arm's reach, m."""
 REFERENCE_PLACES = ((0.0, 0.0), (-0.1, 0.25), (-0.1, -0.25), (0.1, 0.15), (0.1, -0.15))
 """Where to look for room for a reference that is moved (x, y), m."""
+ELSEWHERE = ((0.0, 0.3), (0.0, -0.3))
+"""Where to look for room for what is put aside, should no arrangement beside where it stood hold
+(x, y), m."""
 FAMILIES = (deep_grasps, other_grasps, leaning_grasps)
 """The grasps of a box, the preferred first."""
 SKY = 2.0
@@ -181,8 +184,18 @@ class PoseBound:
     def place_all(self, order: tuple[str, ...], tries: int = 8) -> Iterator[list[Placement]]:
         """Poses for every moved box: first the subject's, then the others' around it.
 
-        Placing the subject first loses fewer tasks than placing greedily in time order.
+        Placing the subject first loses fewer tasks than placing greedily in time order. The others
+        stay near where they stood; should later bounds refuse all of that, they go elsewhere.
         """
+        yield from self._arrangements(order, None, tries)
+        if frozenset(order) - {self.problem.goal.subject, self.problem.goal.reference}:
+            for aside in ELSEWHERE:
+                yield from self._arrangements(order, aside, 1)
+
+    def _arrangements(
+        self, order: tuple[str, ...], aside: tuple[float, float] | None, tries: int
+    ) -> Iterator[list[Placement]]:
+        """Poses for every moved box, the others near `aside` (x, y), m; None for where they stood."""
         subject = self.problem.subject
         gone = frozenset(order) - {subject.name}
         for reference in self._references(order):
@@ -190,7 +203,7 @@ class PoseBound:
                 bottom = reference.top if self.problem.goal.predicate.stacked else 0.0
                 parts = place.grasp.parts
                 kept = volumes(parts, place.pose, bottom, bottom + subject.size[2], SKY)
-                found = self._place_blockers(order, kept, reference)
+                found = self._place_blockers(order, kept, reference, aside)
                 if found is not None:
                     yield [*found, place]
                     if place.grasp.lopsided:
@@ -424,7 +437,11 @@ class PoseBound:
         return np.array([0.0, 0.0, 0.0, *(self.problem.table - TABLE_MARGIN)])
 
     def _place_blockers(
-        self, order: tuple[str, ...], kept: np.ndarray, reference: Box
+        self,
+        order: tuple[str, ...],
+        kept: np.ndarray,
+        reference: Box,
+        aside: tuple[float, float] | None,
     ) -> list[Placement] | None:
         """Free table poses of all but the last, clear of what is still there when they land.
 
@@ -434,7 +451,7 @@ class PoseBound:
         landed = np.empty((0, UPRIGHT))
         for i, name in enumerate(order[:-1]):
             box = self.problem.boxes[name]
-            prefer, area, reserved = box.position[:2], self._table(), kept
+            prefer, area, reserved = aside or box.position[:2], self._table(), kept
             if name == reference.name:
                 prefer, reserved = reference.position[:2], kept[:0]  # kept was laid out around it
                 area = np.array([*prefer, 0.0, 0.002, 0.002])
