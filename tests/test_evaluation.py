@@ -20,6 +20,7 @@ from relevance.evaluation import (
     EvaluationConfig,
     EvaluationError,
     NetworkScorer,
+    accuracy_table,
     checkpoint_id,
     choose_tasks,
     compare,
@@ -34,10 +35,11 @@ from relevance.evaluation import (
 )
 from relevance.models import BODIES, RelevanceModel
 from relevance.planner import plan
+from relevance.report import page
 from relevance.scene import Box, Camera, Goal, Scene
 from relevance.simulation import Renderer
 from relevance.store import Dataset
-from relevance.training import CheckpointError, load_checkpoint, save_checkpoint
+from relevance.training import CheckpointError, TrainConfig, load_checkpoint, save_checkpoint
 
 BLOCKED = Scene(
     objects=(
@@ -351,6 +353,24 @@ def test_predictions_are_judged_by_the_policy_that_the_checkpoint_learned(tmp_pa
     assert rows
     assert all(row["relevant"] for row in rows)
     assert read_predictions(dataset, "glimpse-foreign").accuracy().share_relevant == 1.0
+
+
+def test_a_network_for_one_predicate_is_judged_by_that_one_alone(tmp_path) -> None:
+    root, checkpoint = copied(tmp_path)
+    _, meta = load_checkpoint(checkpoint)
+    config = meta["config"] | {"predicates": ["on"]}
+    alone = tmp_path / "alone.pt"
+    model = RelevanceModel(TrainConfig.from_dict(config).model, ["on"])
+    save_checkpoint(alone, model, meta | {"config": config, "checkpoint_id": "glimpse-alone"})
+    assert predict(root, alone) > 0
+    assert evaluate(root, alone, EVALUATION) > 0
+    dataset = Dataset.open(root)
+    of_it = {"checkpoint_id": "glimpse-alone"}
+    assert {row["predicate"] for row in dataset.read_rows("predictions", **of_it)} == {"on"}
+    assert {row["predicate"] for row in dataset.read_rows("evaluations", **of_it)} == {"on"}
+    assert unjudged(dataset, "glimpse-alone") == []
+    assert accuracy_table(read_predictions(dataset, "glimpse-alone"))
+    assert page.build(root, checkpoint_id="glimpse-alone").is_file()
 
 
 def test_a_policy_that_the_dataset_does_not_have_is_refused_and_nothing_is_left(tmp_path) -> None:

@@ -37,23 +37,25 @@ def predict(
 ) -> int:
     """Score every labelled object of a split's shards into `predictions`; returns the row count.
 
-    Labels are those of the checkpoint's policy; EvaluationError when the split has none.
+    Labels are those of the checkpoint's policy, of the predicates that it has a head for;
+    EvaluationError when the split has none.
     """
     dataset = Dataset.open(root)
     scorer, meta = open_checkpoint(checkpoint)
-    of = labelled_by(dataset, scorer.policy)
-    if not dataset.files("labels", of=of, split=split):
+    of, heads = labelled_by(dataset, scorer.policy), scorer.model.predicates
+    if not any(dataset.files("labels", of=of, split=split, predicate=name) for name in heads):
         raise EvaluationError(
             f"{dataset.path}: no labels of split {split} by policy {scorer.policy}, which the "
-            f"checkpoint learned; `relevance label {dataset.path} --policy {scorer.policy}` "
-            "makes them"
+            f"checkpoint learned ({', '.join(heads)}); `relevance label {dataset.path} --policy "
+            f"{scorer.policy}` makes them"
         )
     enter(dataset, checkpoint, meta)
     shards, count = dataset.shards(split) if shards is None else shards, 0
     for number, shard in enumerate(shards, 1):
         labels: dict[str, dict[Goal, dict[str, dict[str, Any]]]] = defaultdict(dict)
         for row in dataset.read_rows("labels", of=of, split=split, shard=shard):
-            labels[row["scene_id"]].setdefault(_goal(row), {})[row["query"]] = row
+            if row["predicate"] in heads:
+                labels[row["scene_id"]].setdefault(_goal(row), {})[row["query"]] = row
         rows: list[dict[str, Any]] = []
         for sample in dataset.samples(split, [shard]) if labels else ():
             goals = labels.get(sample.scene.id, {})
@@ -103,14 +105,16 @@ def _goal(row: dict[str, Any]) -> Goal:
 def unjudged(dataset: Dataset, checkpoint_id: str, *, split: str = "test") -> list[str]:
     """What keeps the predictions of a checkpoint from being those of the present labels, in words.
 
-    Labels are younger than predictions after another planner or policy made them.
+    Labels are younger than predictions after another planner or policy made them. Those of
+    predicates of which it says nothing are none of its own.
     """
     policy = policy_of_checkpoint(dataset, checkpoint_id)
     with dataset.connect(policy=policy) as connection:
         ((scores, labels, both, changed),) = connection.execute(
             """
             with p as (from predictions where checkpoint_id = $1 and split = $2),
-                l as (from labels where policy = $3 and split = $2)
+                l as (from labels where policy = $3 and split = $2
+                    and predicate in (select predicate from p))
             select (select count(*) from p), (select count(*) from l), count(*),
                 count_if(p.relevant <> l.relevant)
             from p join l using (scene_id, predicate, subject, reference, query)

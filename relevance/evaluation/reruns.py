@@ -111,8 +111,11 @@ class Task:
     """Its place among the tasks of its predicate and family, from 1."""
 
 
-def choose_tasks(dataset: Dataset, *, split: str, per_predicate: int) -> list[Task]:
+def choose_tasks(
+    dataset: Dataset, *, split: str, per_predicate: int, predicates: Sequence[str] = ()
+) -> list[Task]:
     """Planned goals of a split, unselected: the first by the hash of their id; 0 takes all.
+    predicates: the only ones (none: all).
 
     Tasks that have no plan stay in: a user meets them too.
     """
@@ -122,11 +125,11 @@ def choose_tasks(dataset: Dataset, *, split: str, per_predicate: int) -> list[Ta
             select plan_id, scene_id, shard, predicate, subject, reference, nth from (
                 select *, row_number() over (
                     partition by family, predicate order by md5(plan_id)) as nth
-                from plans left join shard_families using (split, shard) where split = ?)
-            where ? = 0 or nth <= ?
+                from plans left join shard_families using (split, shard) where split = $1)
+            where ($2 = 0 or nth <= $2) and ($3 = [] or list_contains($3, predicate))
             order by predicate, family, nth
             """,
-            [split, per_predicate, per_predicate],
+            [split, per_predicate, list(predicates)],
         ).fetchall()
     return [
         Task(
@@ -158,19 +161,25 @@ def evaluate(
     scorer = load_scorer(checkpoint, into=dataset)
     shards = dataset.shards(config.split) if shards is None else shards
     tasks: dict[int, list[Task]] = {shard: [] for shard in shards}
-    for task in choose_tasks(dataset, split=config.split, per_predicate=config.tasks):
+    chosen = choose_tasks(
+        dataset,
+        split=config.split,
+        per_predicate=config.tasks,
+        predicates=scorer.model.predicates,
+    )
+    for task in chosen:
         if task.shard in tasks:
             tasks[task.shard].append(task)
     total, done, count = sum(map(len, tasks.values())), 0, 0
-    for shard, chosen in tasks.items():
+    for shard, here in tasks.items():
         where = {"name": scorer.checkpoint_id, "split": config.split, "shard": shard}
-        made_by = content_hash([hash_of(config), [task.plan_id for task in chosen]])
+        made_by = content_hash([hash_of(config), [task.plan_id for task in here]])
         file = dataset.shard_path("evaluations", **where)
         if file.is_file() and dataset.metadata(file).get("made_by") == made_by:
-            done, count = done + len(chosen), count + dataset.read_file(file).num_rows
+            done, count = done + len(here), count + dataset.read_file(file).num_rows
             continue
         rows: list[dict[str, Any]] = []
-        for found in _reruns(dataset, shard, chosen, scorer, config):
+        for found in _reruns(dataset, shard, here, scorer, config):
             rows += found
             done += 1
             if progress:

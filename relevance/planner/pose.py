@@ -195,7 +195,7 @@ class PoseBound:
     def _arrangements(
         self, order: tuple[str, ...], aside: tuple[float, float] | None, tries: int
     ) -> Iterator[list[Placement]]:
-        """Poses for every moved box, the others near `aside` (x, y), m; None for where they stood."""
+        """`place_all` with the others near `aside` (x, y), m; None for where they stood."""
         subject = self.problem.subject
         gone = frozenset(order) - {subject.name}
         for reference in self._references(order):
