@@ -27,10 +27,11 @@ def known():
 
 todo = tasks(24, 5)
 compiling.other_half()
-assert keyframes.solve.overloads and motions.retreat.overloads
-assert not planar.find_pose.overloads and not motions.motion.overloads
+for kernel in (planar.find_pose, motions.retreat, keyframes.solve):
+    assert kernel.overloads, kernel
+assert not motions.motion.overloads
 compiling.first_half()
-assert planar.find_pose.overloads and motions.motion.overloads
+assert motions.motion.overloads
 warm_up()
 before = known()
 assert before["relevance.planner.kernels.motions.motion"] == 1
