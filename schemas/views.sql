@@ -100,8 +100,8 @@ WHERE holds
 GROUP BY family, predicate, split, n_actions
 ORDER BY ALL;
 
--- Goals that made no labels, by reason; a plan that a check refuted or that the replay refused
--- stands here too.
+-- Goals that made no labels, by what ended the search, objects' names left out; a plan that a check
+-- refuted or that the replay refused stands here too.
 CREATE OR REPLACE VIEW plan_failures AS
 SELECT
     family, predicate, split,
@@ -114,7 +114,12 @@ SELECT
         WHEN status = 'refused' THEN coalesce(nullif(replay_reason, ''), reason)
         WHEN status <> 'solved' OR NOT check_ok THEN reason
         ELSE replay_reason
-    END AS reason,
+    END.split_part('; ', -1)
+    .regexp_replace(' while .+ stands? there$', ' while others stand there')
+    .regexp_replace('^.+ stands on .+ and would', 'the subject stands on something and would')
+    .regexp_replace(
+        '^.+ (would have to leave|may not be moved|cannot be (taken|grasped))', 'something \1'
+    ) AS reason,
     count(*) AS goals
 FROM plans LEFT JOIN shard_families USING (split, shard)
 WHERE NOT holds

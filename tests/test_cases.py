@@ -76,7 +76,9 @@ def test_a_goal_that_holds_already_takes_no_action() -> None:
 
 @pytest.mark.parametrize(
     ("scene", "most"),
-    zip(read_scenes(CASES / "narrow-or-leaning.jsonl"), (2, 3, 1, 2, 3, 3, 2, 3, 3, 3), strict=True),
+    zip(
+        read_scenes(CASES / "narrow-or-leaning.jsonl"), (2, 3, 1, 2, 3, 3, 2, 3, 3, 3), strict=True
+    ),
     ids=lambda value: value.id if isinstance(value, Scene) else str(value),
 )
 def test_what_a_narrow_or_leaning_hand_can_take_is_taken(scene: Scene, most: int) -> None:
@@ -87,6 +89,14 @@ def test_what_a_narrow_or_leaning_hand_can_take_is_taken(scene: Scene, most: int
     assert len(result.moved) <= most
     assert result.replay is not None
     assert result.replay.ok
+
+
+def test_it_is_said_why_what_is_in_the_way_cannot_leave() -> None:
+    result = planned("both-in-the-way")
+    assert (result.status, result.blocking) == ("infeasible", ("moss",))
+    assert result.reason == (
+        "moss would have to leave first; moss cannot be taken while red stands there"
+    )
 
 
 def test_an_arm_goes_around_a_pole() -> None:

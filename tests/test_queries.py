@@ -441,6 +441,29 @@ def test_what_queries_give(dataset: Dataset, tmp_path: Path) -> None:
     assert sql(dataset.path, f"FROM read_csv('{tmp_path}/mine.csv')") == (["x"], [(1,)])
 
 
+def test_failures_are_grouped_without_the_names_of_objects(dataset: Dataset) -> None:
+    reasons = {
+        "b0, b1 would have to leave first": "something would have to leave first",
+        "b0 would have to leave first; b0 cannot be taken while b1, b2 stand there": (
+            "something cannot be taken while others stand there"
+        ),
+        "b3 cannot be grasped: too wide for the hand": (
+            "something cannot be grasped: too wide for the hand"
+        ),
+        "b0 would have to leave first; max_actions: no plan of up to 6 actions": (
+            "max_actions: no plan of up to 6 actions"
+        ),
+    }
+    no = {"status": "infeasible", "holds": False, "check_ok": False}
+    rows = [
+        plan_values(scene, reason=reason, **no)
+        for scene, reason in zip(fill(dataset), reasons, strict=False)
+    ]
+    dataset.write_rows("plans", rows, made_by={"planner": "1", "config": "c"}, **LABELS)
+    found = sql(dataset.path, "SELECT reason FROM plan_failures")[1]
+    assert sorted(reason for (reason,) in found) == sorted(reasons.values())
+
+
 def test_refused_plans_are_failures_of_their_own(dataset: Dataset) -> None:
     scenes = fill(dataset)
     no = {"holds": False, "replay_ok": False, "replay_reason": "it slips"}

@@ -130,6 +130,13 @@ class PoseBound:
             self.problem.undecided |= surely != perhaps
         return found
 
+    def missing(self, name: str, gone: frozenset[str]) -> frozenset[str]:
+        """A smallest set that still has to leave before the object can be taken."""
+        sets = chain.from_iterable(self._blockers(name, family).sets for family in FAMILIES)
+        still = (who - gone for who in sets)
+        fewest = min(still, key=lambda who: (len(who), sorted(who)), default=frozenset())
+        return fewest | self.problem.above[name] - gone
+
     def choices(self, name: str, gone: frozenset[str]) -> Iterator[tuple[Grasp, ...]]:
         """Ways to take an object, the best first: one deep grasp each, then all others across one
         edge, then all that lean."""

@@ -281,6 +281,7 @@ class _Search:
         said = []
         if blocking:
             said.append(f"{', '.join(blocking)} would have to leave first")
+            leaving = frozenset(self._leaving([n for n in self.order if n not in self.stuck]))
             for name in blocking:
                 if name not in self.allowed:
                     said.append(f"{name} may not be moved")
@@ -291,6 +292,10 @@ class _Search:
                     )
                 elif not self.pose.grasps(name):
                     said.append(f"{name} cannot be grasped: {self._why_not(name)}")
+                elif beside := self.pose.missing(name, leaving):
+                    names = [other for other in problem.boxes if other in beside]
+                    stand = "stand" if len(names) > 1 else "stands"
+                    said.append(f"{name} cannot be taken while {', '.join(names)} {stand} there")
         if self.cut and status == "limit":
             said.append(f"max_actions: no plan of up to {self.config.max_actions} actions")
         if status == "limit":

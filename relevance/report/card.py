@@ -264,9 +264,7 @@ def _visibility(found: Statistics) -> Figure | None:
 def _failures(found: Statistics) -> Figure | None:
     goals: dict[str, int] = {}
     for row in _dicts(found["plan_failures"]):
-        # Reasons that start with an object's name differ in it alone.
-        reason = row["reason"] if row["status"] != "infeasible" else _general(row["reason"])
-        goals[reason] = goals.get(reason, 0) + row["goals"]
+        goals[row["reason"]] = goals.get(row["reason"], 0) + row["goals"]
     if not goals:
         return None
     ordered = sorted(goals.items(), key=lambda item: (item[1], item[0]))[-8:]
@@ -277,11 +275,6 @@ def _failures(found: Statistics) -> Figure | None:
     ax.bar_label(bars, [str(n) for _, n in ordered], fontsize=8, padding=3)
     ax.set_xlabel("goals, %")
     return figure
-
-
-def _general(reason: str) -> str:
-    head, verb, rest = reason.partition(" cannot ")
-    return f"the subject cannot {rest}" if verb and " " not in head else reason
 
 
 def _seconds(found: Statistics) -> Figure | None:

@@ -96,8 +96,7 @@ def planner_section(rows: Any) -> dict[str, Any]:
     counts_of = {row["group"]: row for row in counts}
     reasons = rows(
         """
-        -- what names objects differs from goal to goal; what ended the search comes last
-        select status, split_part(reason, '; ', -1) as reason, sum(goals)::bigint as goals
+        select status, reason, sum(goals)::bigint as goals
         from plan_failures group by all
         order by goals desc, status, reason
         """
