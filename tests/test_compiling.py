@@ -73,7 +73,7 @@ def test_kernels_are_compiled_once_and_one_line_says_so(unused, capsys):
         compiling.compile_once(lambda: unused.append("rest"))
     assert unused == ["others", "motions", "rest", "rest"]
     assert capsys.readouterr().err.splitlines() == [
-        "compiling the planner's kernels, once on this machine: about 20 s"
+        "compiling the planner's kernels, once on this machine: about 25 s"
     ]
 
 

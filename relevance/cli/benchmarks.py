@@ -150,7 +150,7 @@ def _training(_: Preset) -> Callable[..., int]:
         folder = out or Path("data/bench/training")
         folder.mkdir(parents=True, exist_ok=True)
         if dataset:
-            rows = []
+            rows, measured = [], learned([], minutes)
             for name, run in learning_runs(
                 dataset,
                 bodies=bodies,
@@ -162,8 +162,8 @@ def _training(_: Preset) -> Callable[..., int]:
             ):
                 with bar(name) as progress:
                     rows += run(progress)
-                write(learned(rows, minutes), folder)
-            measured = learned(rows, minutes)
+                measured = learned(rows, minutes)
+                write(measured, folder)
         else:
             with bar("bodies") as progress:
                 measured = measure_training(

@@ -115,9 +115,9 @@ def choose_tasks(
     dataset: Dataset, *, split: str, per_predicate: int, predicates: Sequence[str] = ()
 ) -> list[Task]:
     """Planned goals of a split, unselected: the first by the hash of their id; 0 takes all.
-    predicates: the only ones (none: all).
 
-    Tasks that have no plan stay in: a user meets them too.
+    predicates: of these alone; none for all. Tasks that have no plan stay in: a user meets them
+    too.
     """
     with dataset.connect() as connection:
         rows = connection.execute(
@@ -161,25 +161,22 @@ def evaluate(
     scorer = load_scorer(checkpoint, into=dataset)
     shards = dataset.shards(config.split) if shards is None else shards
     tasks: dict[int, list[Task]] = {shard: [] for shard in shards}
-    chosen = choose_tasks(
-        dataset,
-        split=config.split,
-        per_predicate=config.tasks,
-        predicates=scorer.model.predicates,
-    )
-    for task in chosen:
+    heads = scorer.model.predicates
+    for task in choose_tasks(
+        dataset, split=config.split, per_predicate=config.tasks, predicates=heads
+    ):
         if task.shard in tasks:
             tasks[task.shard].append(task)
     total, done, count = sum(map(len, tasks.values())), 0, 0
-    for shard, here in tasks.items():
+    for shard, chosen in tasks.items():
         where = {"name": scorer.checkpoint_id, "split": config.split, "shard": shard}
-        made_by = content_hash([hash_of(config), [task.plan_id for task in here]])
+        made_by = content_hash([hash_of(config), [task.plan_id for task in chosen]])
         file = dataset.shard_path("evaluations", **where)
         if file.is_file() and dataset.metadata(file).get("made_by") == made_by:
-            done, count = done + len(here), count + dataset.read_file(file).num_rows
+            done, count = done + len(chosen), count + dataset.read_file(file).num_rows
             continue
         rows: list[dict[str, Any]] = []
-        for found in _reruns(dataset, shard, here, scorer, config):
+        for found in _reruns(dataset, shard, chosen, scorer, config):
             rows += found
             done += 1
             if progress:
