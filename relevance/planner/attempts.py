@@ -65,8 +65,7 @@ class Attempt(ABC):
         self.exhausted = True
         """Whether the search ended by itself, not at its limit."""
         self.refused_late = False
-        self.stuck = frozenset[str]()
-        """What can never be picked."""
+        self._staying = dict[str, bool]()
         self.late = False
         """Whether the last set passed all relaxations, and failed after."""
         self.cut = False
@@ -155,14 +154,22 @@ class Attempt(ABC):
     def _might(self) -> bool:
         """Whether a plan is possible once all that can leave has left, or the reference moves."""
         goal = self.problem.goal
-        gone = frozenset(self.order) - self.stuck - {goal.subject, goal.reference}
-        return self._reference_moves() or self._works(gone)
+        if self._reference_moves():
+            return True
+        gone = frozenset(name for name in self.order if not self._stays(name))
+        return self._works(gone - {goal.subject, goal.reference})
 
-    def _stuck(self) -> frozenset[str]:
-        """What can never be picked: it cannot be grasped, or carries what does not leave first."""
-        stays = set(self.problem.boxes) - self.allowed | {self.problem.goal.subject}
-        stays |= {name for name in self.allowed if not self.pose.grasps(name)}
-        return frozenset(name for name in self.allowed if self._carried_by(name) & stays) | stays
+    def _stays(self, name: str) -> bool:
+        """Whether an object can never be picked: it cannot be grasped, or carries what does not
+        leave first."""
+        if name not in self._staying:
+            carried = self._carried_by(name)
+            self._staying[name] = (
+                self.problem.goal.subject in carried
+                or not carried <= self.allowed
+                or not all(self.pose.grasps(each) for each in (name, *carried))
+            )
+        return self._staying[name]
 
     def _exhausted(self, status: Status, blocking: tuple[str, ...]) -> str:
         """Why the search ended without a plan, in the words of the task."""
@@ -290,25 +297,30 @@ class Attempt(ABC):
 
         return extend(())
 
-    def _finish(self, gone: frozenset[str], prefixes: Iterable[tuple[str, ...]]) -> Motion | None:
-        """Pick the subject once `gone` have left and place it at the goal: all bounds in turn."""
-        problem, goal = self.problem, self.problem.goal
-        if not self.pose.pickable(goal.subject, gone):
-            return None
+    def _passes(self, gone: frozenset[str]) -> bool:
+        """Whether the subject could be picked once these have left, and be put at the goal."""
+        problem = self.problem
+        if not self.pose.pickable(problem.goal.subject, gone):
+            return False
         reference = problem.reference
         if reference.name not in gone and not any(self.pose.goal_poses(gone, reference)):
-            return None
+            return False
         self._visit()
         self.late = True
-        prefixes = iter(prefixes)
+        return True
+
+    def _motion(self, prefixes: Iterable[tuple[str, ...]]) -> Generator[None, None, Motion | None]:
+        """Move these in order, then the subject: what passes all bounds, of the first orders."""
+        problem, prefixes = self.problem, iter(prefixes)
         for prefix in islice(prefixes, ORDERS):
-            order = (*prefix, goal.subject)
+            order = (*prefix, problem.goal.subject)
             if order in self.bounds.refused:
                 self.refused_late |= self.bounds.refused[order]
                 continue
             tried = False
             for placements in self.pose.place_all(order):
                 problem.counts.sequences += not tried
+                problem.counts.squares += len(order) ** 2
                 tried = True
                 solved = self.bounds.keyframes.solve(order, placements)
                 if solved is None:
@@ -319,6 +331,7 @@ class Attempt(ABC):
                         return motion
                     problem.open.add("whether there is a motion between the switches")
                 self.refused_late = True
+                yield
             if not tried:
                 problem.undecided = True
                 problem.open.add("where to put what is in the way")

@@ -29,13 +29,13 @@ class Levels(Attempt):
         if self.hopeless is not None:
             return []
         reference, found = self.problem.goal.reference, list[Motion]()
-        self.stuck = self._stuck()
-        movable = [name for name in self.order if name not in self.stuck]
         levels = self._sequences if self.config.search == "tree" else self._sets
         if self._within_reach():
-            found = yield from levels([name for name in movable if name != reference], frozenset())
+            found = yield from levels(
+                [name for name in self.order if name != reference], frozenset()
+            )
         if not found and self._reference_moves():
-            found = yield from levels(movable, frozenset({reference}))
+            found = yield from levels(self.order, frozenset({reference}))
         return found
 
     def _sequences(self, movable: list[str], required: frozenset[str]) -> Turns:
@@ -50,13 +50,15 @@ class Levels(Attempt):
                     return []
             for prefix in frontier:
                 self._visit()
-                if required <= set(prefix):
-                    motion = self._finish(frozenset(prefix), [prefix])
+                if required <= set(prefix) and self._passes(frozenset(prefix)):
+                    motion = yield from self._motion([prefix])
                     if motion is not None:
                         found.append(motion)
                         if self.config.stop == "first":
                             return found
                 yield
+                if not prefix:
+                    movable = [name for name in movable if not self._stays(name)]
                 for name in movable:
                     if name == subject or name in prefix:
                         continue
@@ -77,6 +79,10 @@ class Levels(Attempt):
         subject, near = self.problem.goal.subject, self._beside_goal()
         rank = {name: i for i, name in enumerate(movable) if name != subject}
         frontier, rest = [frozenset[str]()], list[frozenset[str]]()
+
+        def leaves(name: str) -> bool:
+            return name in rank and not self._stays(name)
+
         for level in range(self.config.max_actions // 2):
             found, tried = [], list[tuple[frozenset[str], frozenset[str], bool]]()
             if level == LOOK:
@@ -89,8 +95,8 @@ class Levels(Attempt):
             for chosen in self._tiers(frontier, rest, found):
                 self._visit()
                 self.late, open_picks = False, self._open_picks(chosen)
-                if required <= chosen and not open_picks:
-                    motion = self._finish(chosen, self._orders(chosen))
+                if required <= chosen and not open_picks and self._passes(chosen):
+                    motion = yield from self._motion(self._orders(chosen))
                     if motion is not None:
                         found.append(motion)
                         if self.config.stop == "first":
@@ -105,9 +111,9 @@ class Levels(Attempt):
                 helpful = required - chosen or near
                 if open_picks:
                     helpful = frozenset().union(*map(self.pose.in_the_way, open_picks))
-                following |= {chosen | {name} for name in helpful - chosen if name in rank}
+                following |= {chosen | {name} for name in helpful - chosen if leaves(name)}
                 if late:  # the others' leaving can make room for what is put aside
-                    others |= {chosen | {name} for name in rank if name not in chosen}
+                    others |= {chosen | {name} for name in rank.keys() - chosen if leaves(name)}
             frontier = sorted(following, key=partial(_ranks, rank))
             rest = sorted(others - following, key=partial(_ranks, rank))
         self.cut |= bool(frontier or rest)

@@ -32,6 +32,9 @@ CERTAIN = 6.0
 DOUBT = 8
 """After how many sets the search asks what can be picked at all, and whether a plan is possible."""
 
+REMEMBERED = 64
+"""How many refused sets others are compared with."""
+
 _Key = tuple[float, ...]
 
 
@@ -76,7 +79,6 @@ class Likely(Attempt):
             self._steps[goal.reference] += LANDMARK
         self._most = config.max_actions // 2 - 1
         """Objects that may leave before the subject is taken."""
-        self._movable = dict[str, bool]()
         self._heap = list[tuple[_Key, int, _Set | _Growth]]()
         self._pushed = 0
         self._seen = {frozenset[str]()}
@@ -92,6 +94,8 @@ class Likely(Attempt):
         if not self._reference_moves():
             names = [n for n in names if n != goal.reference]
         self._names = sorted(names, key=self._turn)
+        self._leaves = frozenset(names)
+        """What can leave, as far as the search has asked."""
 
     @property
     def conclusive(self) -> bool:
@@ -127,7 +131,7 @@ class Likely(Attempt):
                 break
             if isinstance(item, _Growth):
                 self._grow(item)
-            elif motions := self._test(item.chosen):
+            elif motions := (yield from self._test(item.chosen)):
                 found, until = found + motions, key[:-1]
                 if not self.shortest or self.config.stop == "first":
                     break
@@ -135,7 +139,6 @@ class Likely(Attempt):
                 self._open(_Growth(of=item, by=self._others(item.chosen), rest=True, sifted=True))
             yield
         if not found:
-            self.stuck = self._stuck()
             self.cut = any(self._can_grow(chosen) for chosen in self._deepest)
         return found
 
@@ -188,23 +191,17 @@ class Likely(Attempt):
 
     def _can_move(self, name: str, chosen: frozenset[str]) -> bool:
         """Whether an object can leave: once these have (`tree`), or at all (`informed`)."""
-        if self._movable.get(name) is False:
+        if name not in self._leaves:
             return False
         if self.config.search == "tree":
             return self.pose.pickable(name, chosen)
-        if name not in self._movable:
-            stays = {other for other in self._carried_by(name) if other not in self._steps}
-            stays |= {n for n in (name, *self._carried_by(name)) if not self.pose.grasps(n)}
-            self._movable[name] = not stays and self.problem.goal.subject not in self._carried_by(
-                name
-            )
-        return self._movable[name]
+        return not self._stays(name)
 
     def _can_grow(self, chosen: frozenset[str]) -> bool:
         names = self._helpful(chosen, self._others(chosen))
         return any(self._can_move(name, chosen) for name in names)
 
-    def _test(self, chosen: frozenset[str]) -> list[Motion]:
+    def _test(self, chosen: frozenset[str]) -> Turns:
         """The plans that move a set and then the subject."""
         self.late = False
         moves = self.problem.goal.reference in chosen
@@ -216,24 +213,32 @@ class Likely(Attempt):
         open_picks = self._open_picks(chosen) if self.config.search == "informed" else ()
         if open_picks:
             if self.problem.goal.subject in open_picks:
-                self._refused[moves].append(chosen)
+                self._refuse(chosen)
             return []
-        orders = self._orders(chosen)
+        if not self._passes(chosen):
+            self._refuse(chosen)
+            return []
+        orders, found = self._orders(chosen), list[Motion]()
         if self.shortest and self.config.search == "tree" and self.config.stop == "level":
-            each = (self._finish(chosen, [order]) for order in orders)
-            found = [motion for motion in each if motion is not None]
+            apart = ([order] for order in orders)  # there each is a plan of its own
         else:
-            motion = self._finish(chosen, orders)
-            found = [] if motion is None else [motion]
-        if not found and not self.late:
-            self._refused[moves].append(chosen)
+            apart = [orders]
+        for some in apart:
+            motion = yield from self._motion(some)
+            if motion is not None:
+                found.append(motion)
         return found
+
+    def _refuse(self, chosen: frozenset[str]) -> None:
+        """Remember that the pose bound refuses a set; the first are the likeliest and largest."""
+        refused = self._refused[self.problem.goal.reference in chosen]
+        if not self.shortest and len(refused) < REMEMBERED:
+            refused.append(chosen)
 
     def _doubt(self) -> None:
         """Leave out what can never be picked, and what cannot be a plan."""
         reference = self.problem.goal.reference
-        leaving = set(self._leaving(self._names))
-        self._movable |= {name: False for name in self._names if name not in leaving}
+        self._leaves = frozenset(self._leaving(self._names))
         without = self._leaving([name for name in self._names if name != reference])
         self._stands = self._within_reach() and self._works(frozenset(without))
         if not (self._stands or self._reference_moves()):

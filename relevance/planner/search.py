@@ -31,10 +31,9 @@ from relevance.planner.result import (
 )
 from relevance.scene import Box, Goal, Scene, goal_holds
 
-SHARE = 10_000
-"""Work of the first turn of a guided attempt; later ones are twice as long each."""
-TRUST = 4
-"""How much more work a guided attempt may do than the unguided one beside it."""
+SHARE = 20_000
+"""Work of the first turns, of the guided attempt and the unguided one; later ones are twice as
+long each."""
 
 
 def plan(
@@ -166,7 +165,7 @@ class _Planning:
                     return result
                 result = plain.go(math.inf)
             else:
-                result = plain.go(share / TRUST)
+                result = plain.go(share)
             if result is not None:
                 return result
             share *= 2
