@@ -1,14 +1,15 @@
 """One attempt at a problem: what every search does with a set of moved objects, and its verdict.
 
 An attempt may move some objects, within a number of nodes. Each set is tested by the bounds in
-order of their cost: logic, pose, keyframe, path. What the late bounds refused is remembered for
-all attempts at the problem: no later one tries it again.
+order of their cost: logic, pose, keyframe, path. What a bound refused is remembered for all
+attempts at the problem: no other tries it again.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterable, Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress, islice
 
@@ -18,7 +19,7 @@ from relevance.planner.grasps import fits, grasps
 from relevance.planner.kernels.planar import reaching_into
 from relevance.planner.keyframes import KeyframeBound
 from relevance.planner.path import Motion, PathBound
-from relevance.planner.pose import PoseBound
+from relevance.planner.pose import Placement, PoseBound
 from relevance.planner.problem import Problem
 from relevance.planner.result import PlannerConfig, PlanResult, Status
 
@@ -39,6 +40,15 @@ class _Limit(Exception):
     """The node limit was reached."""
 
 
+@dataclass(slots=True)
+class _Tries:
+    """The arrangements of an order that nobody has tried yet; none of the others has a motion."""
+
+    placements: Iterator[list[Placement]]
+    begun: bool = False
+    """Whether there was any."""
+
+
 class Bounds:
     """The bounds of one problem, in order of their cost, and what they refused."""
 
@@ -47,8 +57,10 @@ class Bounds:
         self.pose = PoseBound(problem)
         self.keyframes = KeyframeBound(self.pose)
         self.path = PathBound(problem)
-        self.refused: dict[tuple[str, ...], bool] = {}
-        """Orders that have no motion; whether one of the late bounds refused them."""
+        self.tried = dict[tuple[str, ...], _Tries]()
+        """What is left to try of each order."""
+        self.blocked = set[frozenset[str]]()
+        """Sets whose leaving does not let the subject be taken and put at the goal."""
 
 
 class Attempt(ABC):
@@ -299,11 +311,14 @@ class Attempt(ABC):
 
     def _passes(self, gone: frozenset[str]) -> bool:
         """Whether the subject could be picked once these have left, and be put at the goal."""
-        problem = self.problem
-        if not self.pose.pickable(problem.goal.subject, gone):
+        problem, blocked = self.problem, self.bounds.blocked
+        if gone in blocked:
             return False
         reference = problem.reference
-        if reference.name not in gone and not any(self.pose.goal_poses(gone, reference)):
+        if not self.pose.pickable(problem.goal.subject, gone) or (
+            reference.name not in gone and not any(self.pose.goal_poses(gone, reference))
+        ):
+            blocked.add(gone)
             return False
         self._visit()
         self.late = True
@@ -314,14 +329,12 @@ class Attempt(ABC):
         problem, prefixes = self.problem, iter(prefixes)
         for prefix in islice(prefixes, ORDERS):
             order = (*prefix, problem.goal.subject)
-            if order in self.bounds.refused:
-                self.refused_late |= self.bounds.refused[order]
-                continue
-            tried = False
-            for placements in self.pose.place_all(order):
-                problem.counts.sequences += not tried
+            tries = self.bounds.tried.setdefault(order, _Tries(self.pose.place_all(order)))
+            self.refused_late |= tries.begun
+            for placements in tries.placements:
+                problem.counts.sequences += not tries.begun
                 problem.counts.squares += len(order) ** 2
-                tried = True
+                tries.begun = True
                 solved = self.bounds.keyframes.solve(order, placements)
                 if solved is None:
                     problem.open.add("whether the arm reaches all switches at once")
@@ -332,10 +345,9 @@ class Attempt(ABC):
                     problem.open.add("whether there is a motion between the switches")
                 self.refused_late = True
                 yield
-            if not tried:
+            if not tries.begun:
                 problem.undecided = True
                 problem.open.add("where to put what is in the way")
-            self.bounds.refused[order] = tried
         if next(prefixes, None) is not None:
             problem.open.add(f"more than {ORDERS} orders of one set")
         return None

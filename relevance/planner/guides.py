@@ -17,7 +17,7 @@ from relevance.errors import RelevanceError
 from relevance.registry import Registry
 from relevance.scene import Goal, Scene
 
-PATIENCE = 20_000
+PATIENCE = 200
 """Work before a guide that waits asks for scores, where its checkpoint names no other."""
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from heapq import heappop, heappush
 
-from relevance.planner.attempts import Attempt, Bounds, Turns
+from relevance.planner.attempts import LOOK, Attempt, Bounds, Turns
 from relevance.planner.path import Motion
 from relevance.planner.result import PlannerConfig
 
@@ -30,8 +30,8 @@ does it, as far as the prior does not say otherwise."""
 CERTAIN = 6.0
 """No score counts for more, nats."""
 DOUBT = 8
-"""After how many sets the search asks what can be picked at all, and whether a plan is possible."""
-
+"""After how many sets the search asks what can be picked at all, and whether a plan is possible;
+with `shortest` it is from LOOK objects on, as in the unguided searches."""
 REMEMBERED = 64
 """How many refused sets others are compared with."""
 
@@ -79,15 +79,16 @@ class Likely(Attempt):
             self._steps[goal.reference] += LANDMARK
         self._most = config.max_actions // 2 - 1
         """Objects that may leave before the subject is taken."""
-        self._heap = list[tuple[_Key, int, _Set | _Growth]]()
+        self._heap = list[tuple[_Key, bool, int, _Set | _Growth]]()
         self._pushed = 0
         self._seen = {frozenset[str]()}
+        self._picks = dict[frozenset[str], frozenset[str]]()
         self._deepest = list[frozenset[str]]()
         """Sets that may not grow."""
         self._refused = {True: list[frozenset[str]](), False: list[frozenset[str]]()}
         """Sets that the pose bound refuses, by whether the reference is in them."""
-        self._doubts = DOUBT
-        """Sets until the search asks whether there can be a plan."""
+        self._tested = 0
+        self._doubted = False
         self._stands = True
         """Whether a plan may let the reference stand."""
         names = [n for n in self.order if n != goal.subject]
@@ -117,7 +118,7 @@ class Likely(Attempt):
 
     def _push(self, key: _Key, item: _Set | _Growth) -> None:
         self._pushed += 1
-        heappush(self._heap, (key, self._pushed, item))
+        heappush(self._heap, (key, isinstance(item, _Growth), self._pushed, item))
 
     def _plans(self) -> Turns:
         """The first plan; with `shortest` and whole levels all that are as short."""
@@ -126,7 +127,7 @@ class Likely(Attempt):
             return found
         self._add(_Set(chosen=frozenset(), cost=0.0))
         while self._heap:
-            key, _, item = heappop(self._heap)
+            key, _, _, item = heappop(self._heap)
             if found and key[:-1] > until:
                 break
             if isinstance(item, _Growth):
@@ -185,6 +186,11 @@ class Likely(Attempt):
             helpful = frozenset().union(*map(self.pose.in_the_way, open_picks))
         return deque(name for name in names if name in helpful)
 
+    def _open_picks(self, chosen: frozenset[str]) -> frozenset[str]:
+        if chosen not in self._picks:
+            self._picks[chosen] = super()._open_picks(chosen)
+        return self._picks[chosen]
+
     @cached_property
     def _near(self) -> frozenset[str]:
         return self._beside_goal()
@@ -207,9 +213,11 @@ class Likely(Attempt):
         moves = self.problem.goal.reference in chosen
         if not (moves or self._stands) or any(chosen <= other for other in self._refused[moves]):
             return []
-        self._doubts -= 1
-        if self._doubts == 0:
+        self._tested += 1
+        if len(chosen) >= LOOK if self.shortest else self._tested > DOUBT:
             self._doubt()
+            if not (moves or self._stands):
+                return []
         open_picks = self._open_picks(chosen) if self.config.search == "informed" else ()
         if open_picks:
             if self.problem.goal.subject in open_picks:
@@ -236,7 +244,10 @@ class Likely(Attempt):
             refused.append(chosen)
 
     def _doubt(self) -> None:
-        """Leave out what can never be picked, and what cannot be a plan."""
+        """Leave out what can never be picked, and what cannot be a plan; once."""
+        if self._doubted:
+            return
+        self._doubted = True
         reference = self.problem.goal.reference
         self._leaves = frozenset(self._leaving(self._names))
         without = self._leaving([name for name in self._names if name != reference])

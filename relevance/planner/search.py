@@ -31,7 +31,7 @@ from relevance.planner.result import (
 )
 from relevance.scene import Box, Goal, Scene, goal_holds
 
-SHARE = 20_000
+SHARE = 10_000
 """Work of the first turns, of the guided attempt and the unguided one; later ones are twice as
 long each."""
 
@@ -101,11 +101,11 @@ class _Planning:
     def _levels(self, config: PlannerConfig, allowed: frozenset[str], limit: int) -> Levels:
         return Levels(self.bounds, config, allowed, limit)
 
-    def _likely(self, scores: Mapping[str, float], *, shortest: bool) -> Likely:
-        limit = self.config.node_limit
-        return Likely(
-            self.bounds, self.config, self.everything, limit, scores, shortest=shortest
-        )  # fmt: skip
+    def _likely(
+        self, config: PlannerConfig, scores: Mapping[str, float], *, shortest: bool
+    ) -> Likely:
+        limit = config.node_limit
+        return Likely(self.bounds, config, self.everything, limit, scores, shortest=shortest)
 
     def _scores(self) -> Mapping[str, float]:
         began = time.process_time()
@@ -137,35 +137,34 @@ class _Planning:
 
     def _shortest(self) -> PlanResult:
         """Best-first, by length before anything else."""
-        likely = self._likely(self._scores(), shortest=True)
+        likely = self._likely(self.config, self._scores(), shortest=True)
         result = likely.run()
         if result.status == "solved" or likely.conclusive:
             return result
         return self._levels(self.config, self.everything, self.config.node_limit).run()
 
     def _likeliest(self, *, waits: bool) -> PlanResult:
-        """Best-first and unguided in turns; the unguided search begins where the mode waits."""
+        """Best-first and unguided in turns; where the mode waits, by length alone at first."""
         assert self.guide is not None
-        first = replace(self.config, stop="first")
-        plain = _Turns(
-            self._levels(first, self.everything, first.node_limit).turns(), self.problem.counts
-        )
-        share = SHARE
+        first, counts = replace(self.config, stop="first"), self.problem.counts
         if waits:
-            result = plain.go(self.guide.patience)
-            if result is not None:
+            likely = self._likely(first, dict.fromkeys(self.everything, 0.0), shortest=True)
+            result = _Turns(likely.turns(), counts).go(self.guide.patience)
+            if result is not None and (result.status == "solved" or likely.conclusive):
                 return result
-            share = max(share, self.guide.patience)
-        likely = self._likely(self._scores(), shortest=False)
-        guided = _Turns(likely.turns(), self.problem.counts)
+        likely = self._likely(first, self._scores(), shortest=False)
+        plain = self._levels(first, self.everything, first.node_limit)
+        guided, unguided, share = (
+            _Turns(likely.turns(), counts),
+            _Turns(plain.turns(), counts),
+            SHARE,
+        )
         while True:
             result = guided.go(share)
-            if result is not None:
-                if result.status == "solved" or likely.conclusive:
-                    return result
-                result = plain.go(math.inf)
-            else:
-                result = plain.go(share)
+            if result is None:
+                result = unguided.go(share)
+            elif result.status != "solved" and not likely.conclusive:
+                result = unguided.go(math.inf)
             if result is not None:
                 return result
             share *= 2
