@@ -101,7 +101,7 @@ class Likely(Attempt):
     @property
     def conclusive(self) -> bool:
         """Whether no plan was found because there is none: nothing was left untried or open."""
-        return self.exhausted and not self.problem.open
+        return self.exhausted and not self.cut and not self.problem.open
 
     def _turn(self, name: str) -> _Key:
         landmark = self.shortest and name == self.problem.goal.reference
