@@ -14,6 +14,7 @@ import time
 from collections.abc import Collection, Generator, Mapping
 from dataclasses import replace
 from functools import cache
+from itertools import count
 
 from relevance.planner.attempts import Bounds
 from relevance.planner.compiling import compile_once, other_half
@@ -32,8 +33,10 @@ from relevance.planner.result import (
 from relevance.scene import Box, Goal, Scene, goal_holds
 
 SHARE = 10_000
-"""Work of the first turns, of the guided attempt and the unguided one; later ones are twice as
-long each."""
+"""Work of the first turns, of the guided attempt and of the unguided one."""
+LONGER = (2, 4)
+"""How much longer each later turn is, guided and unguided: the longer scores have not helped, the
+less they are trusted."""
 
 
 def plan(
@@ -154,20 +157,16 @@ class _Planning:
                 return result
         likely = self._likely(first, self._scores(), shortest=False)
         plain = self._levels(first, self.everything, first.node_limit)
-        guided, unguided, share = (
-            _Turns(likely.turns(), counts),
-            _Turns(plain.turns(), counts),
-            SHARE,
-        )
-        while True:
-            result = guided.go(share)
+        guided, unguided = (_Turns(attempt.turns(), counts) for attempt in (likely, plain))
+        for turn in count():
+            result = guided.go(SHARE * LONGER[0] ** turn)
             if result is None:
-                result = unguided.go(share)
+                result = unguided.go(SHARE * LONGER[1] ** turn)
             elif result.status != "solved" and not likely.conclusive:
                 result = unguided.go(math.inf)
             if result is not None:
                 return result
-            share *= 2
+        raise AssertionError("the unguided attempt ends")
 
 
 class _Turns:
