@@ -181,9 +181,10 @@ class Likely(Attempt):
         """What a set should grow by, of some names: whatever else leaves, one is among it."""
         if self.config.search == "tree":
             return names
-        open_picks, helpful = self._open_picks(chosen), self._near
-        if open_picks:
+        if open_picks := self._open_picks(chosen):
             helpful = frozenset().union(*map(self.pose.in_the_way, open_picks))
+        else:
+            helpful = self._near
         return deque(name for name in names if name in helpful)
 
     def _open_picks(self, chosen: frozenset[str]) -> frozenset[str]:

@@ -3,8 +3,8 @@
 Without a guide it is one breadth-first attempt (`levels`). A guide that prunes makes several, each
 with other objects that may move. A guide that orders has a best-first attempt (`likely`) take turns
 with the unguided one: what either refuses the other does not try again, nodes of the best-first one
-are no part of the unguided one's limit, and neither gets far ahead of the other. So whatever the
-scores say, all is solved that the unguided search solves, in a small multiple of its work.
+are no part of the unguided one's limit and are capped at it. So whatever the scores say, all is
+solved that the unguided search solves.
 """
 
 from __future__ import annotations
@@ -50,10 +50,11 @@ def plan(
 ) -> PlanResult:
     """Find the shortest sequence of picks and places, and its motion, that makes the goal true.
 
-    config None: the defaults. movable: the objects that may be moved (None: all). replay: whether
-    the plan is executed again in the simulator, which has to confirm it; this is not counted in
-    its seconds. Raises SceneError for an unknown predicate or object. A goal that cannot be
-    reached is a result with a reason.
+    Guided by `order` or `lazy` it is the first that was found, likely but not always of least
+    length; by `shortest` it is. config None: the defaults. movable: the objects that may be moved
+    (None: all). replay: whether the plan is executed again in the simulator, which has to confirm
+    it; this is not counted in its seconds. Raises SceneError for an unknown predicate or object. A
+    goal that cannot be reached is a result with a reason.
     """
     warm_up()
     found = _plan(scene, scene.goal(goal), config or PlannerConfig(), guide, movable)
