@@ -76,9 +76,7 @@ def test_a_goal_that_holds_already_takes_no_action() -> None:
 
 @pytest.mark.parametrize(
     ("scene", "most"),
-    zip(
-        read_scenes(CASES / "narrow-or-leaning.jsonl"), (2, 3, 1, 2, 3, 3, 2, 3, 3, 3), strict=True
-    ),
+    zip(read_scenes(CASES / "narrow-or-leaning.jsonl"), (2, 3, 1, 2, 3, 3, 2, 3, 3, 3), strict=True),
     ids=lambda value: value.id if isinstance(value, Scene) else str(value),
 )
 def test_what_a_narrow_or_leaning_hand_can_take_is_taken(scene: Scene, most: int) -> None:
