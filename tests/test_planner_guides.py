@@ -1,7 +1,6 @@
 """Guides change the effort, never what can be solved; planners and guides come by name."""
 
 import math
-import random
 from dataclasses import dataclass
 
 import pytest
@@ -16,22 +15,12 @@ from relevance.planner import (
 )
 from relevance.planner.guides import Everything, GuideError, Mode
 from relevance.simulation import Replay
-from tests.planning import GREEN, OPEN, box, tasks
+from tests.planning import GREEN, OPEN, Given, Says, box, tasks
 
 
 @pytest.fixture(scope="module")
 def planned():
     return [(scene, goal, plan(scene, goal, replay=False)) for scene, goal in tasks(24, seed=11)]
-
-
-class Says:
-    """Scores from a table."""
-
-    def __init__(self, relevant):
-        self.relevant = relevant
-
-    def scores(self, scene, goal):
-        return {name: 3.0 if name in self.relevant else -3.0 for name in scene.names}
 
 
 def test_guide_that_keeps_everything_equals_no_guide(planned):
@@ -69,67 +58,22 @@ def test_right_guide_saves_nodes_and_wrong_guide_costs_only_with_prune(planned):
     assert kept.counts == unguided.counts
 
 
-class Given:
-    """Scores by a rule."""
-
-    def __init__(self, rule):
-        self.rule = rule
-
-    def scores(self, scene, goal):
-        return {name: self.rule(i) for i, name in enumerate(scene.names)}
-
-
-@pytest.mark.parametrize("search", ["tree", "informed"])
-def test_complete_guides_lose_nothing_that_the_unguided_search_solves_in_as_many_nodes(
-    planned, search
-):
-    draws = random.Random(3)
-    rules = {
-        "random": lambda _: draws.uniform(-4, 4),
-        "reversed": lambda i: float(-i),
-        "constant": lambda _: -1.0,
-    }
-    checked = 0
-    for scene, goal, found in planned:
-        if found.status != "solved" or len(found.moved) < 2:
-            continue
-        full = PlannerConfig(search=search)
-        plain = plan(scene, goal, config=full, replay=False)
-        if plain.status != "solved":
-            continue
-        tight = PlannerConfig(search=search, node_limit=plain.counts.nodes)
-        for mode in (name for name, kind in GUIDES.items() if kind.complete):
-            for rule in rules.values():
-                guide = Guide(scorer=Given(rule), mode=mode)
-                result = plan(scene, goal, config=tight, guide=guide, replay=False)
-                assert result.status == "solved", (mode, result.reason)
-                checked += 1
-        if checked > 60:
-            break
-    assert checked > 30
-
-
 def test_scores_that_are_no_numbers_are_refused():
-    for mode in ("prune", "order", "expand", "prune-then-full"):
-        guide = Guide(scorer=Given(lambda _: math.nan), mode=mode)
+    for mode in (name for name, kind in GUIDES.items() if kind.guided):
+        guide = Guide(scorer=Given(lambda _: math.nan), mode=mode, patience=0)
         with pytest.raises(GuideError, match="the score of 'red' is nan"):
             plan(OPEN, "on(red, blue)", guide=guide)
     with pytest.raises(RelevanceError, match="unknown guide 'prunes', expected one of none, prune"):
         Guide(scorer=Given(float), mode="prunes")
 
 
-def test_first_stops_at_the_first_plan_for_every_guide(planned):
+def test_first_stops_at_the_first_plan(planned):
     fewer = 0
     for scene, goal, found in planned:
         first = plan(scene, goal, config=PlannerConfig(stop="first"), replay=False)
         assert (first.status, len(first.moved)) == (found.status, len(found.moved))
         assert first.counts.nodes <= found.counts.nodes
         fewer += first.counts.nodes < found.counts.nodes
-        guide = Guide(scorer=Given(lambda i: float(-i)), mode="order")
-        ordered = plan(scene, goal, guide=guide, replay=False)  # to the end of the level
-        if found.status == "solved":
-            assert ordered.moved == found.moved
-            assert ordered.counts.nodes == found.counts.nodes
     assert fewer
 
 
@@ -148,7 +92,7 @@ def test_a_guide_registered_from_outside_guides():
         def rounds(self, everything, kept, scores):
             yield everything
 
-    GUIDES.register("backwards", Backwards(name="backwards", color="#000000", ordered=True))
+    GUIDES.register("backwards", Backwards(name="backwards", color="#000000", walk="likeliest"))
     try:
         guide = Guide(scorer=Given(float), mode="backwards")
         assert plan(OPEN, "on(red, blue)", guide=guide).status == "solved"

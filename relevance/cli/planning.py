@@ -48,7 +48,7 @@ def _plan(_: Preset) -> Callable[..., int]:
             planner: ours, or rai: rai's own LGP solver (pip install 'relevance[rai]').
             search: The paper's breadth-first tree, or our informed search.
             guide: How the scores of the checkpoint enter the search: none, prune,
-                prune-then-full, expand or order.
+                prune-then-full, expand, order, shortest or lazy.
             checkpoint: The model that scores the objects, which a guide needs: a file, or the name
                 of one that comes with the package (glimpse, geometry).
             beta: An object is kept when its score exceeds -beta.

@@ -1,8 +1,8 @@
 """How scores enter the search: a registry of guide modes, one small object each.
 
-A mode says which objects each round of the search may move, and how it goes through them. The
-last round of a complete mode is the unguided search with its whole limits, so that no scores can
-lose a task that the unguided search solves.
+A mode says which objects each round of the search may move, or in what order the last round goes
+through sets of them. The last round of a complete mode ends with the unguided search and its whole
+limits, so that no scores can lose a task that the unguided search solves.
 """
 
 from __future__ import annotations
@@ -11,11 +11,14 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 from relevance.errors import RelevanceError
 from relevance.registry import Registry
 from relevance.scene import Goal, Scene
+
+PATIENCE = 200
+"""Work before a guide that waits asks for scores, where its checkpoint names no other."""
 
 
 class GuideError(RelevanceError):
@@ -41,8 +44,13 @@ class Mode(ABC):
     """Whether it finds a plan whenever the unguided search does."""
     guided: bool = True
     """Whether it asks for scores at all."""
-    ordered: bool = False
-    """Whether the search goes through objects by descending score, not by their index."""
+    walk: Literal["levels", "shortest", "likeliest"] = "levels"
+    """How the last round goes through sets of moved objects. `levels`: by their number, then by
+    index, as the unguided search. `shortest`: by their number, then the likeliest first; the plan
+    is of least length. `likeliest`: the likeliest first, whatever their number; the first plan
+    counts, which need not be of least length."""
+    waits: bool = False
+    """Whether the search begins unguided and asks for scores only after the guide's patience."""
 
     @abstractmethod
     def rounds(
@@ -111,7 +119,9 @@ for _mode in (
     Prune(name="prune", color="#c26a1c", complete=False),
     PruneThenFull(name="prune-then-full", color="#2f6db3"),
     Expand(name="expand", color="#3a8a5f"),
-    Everything(name="order", color="#7a5aa6", ordered=True),
+    Everything(name="order", color="#7a5aa6", walk="likeliest"),
+    Everything(name="shortest", color="#b5476b", walk="shortest"),
+    Everything(name="lazy", color="#2a8c94", walk="likeliest", waits=True),
 ):
     GUIDES.register(_mode.name, _mode)
 
@@ -125,36 +135,27 @@ class Guide:
     """A name in GUIDES."""
     beta: float = 0.0
     """An object is kept iff its score > -beta; a larger beta keeps more."""
+    patience: int = PATIENCE
+    """Work (`Counts.work`) that a search does before a mode that waits asks for scores."""
 
     def __post_init__(self) -> None:
         GUIDES[self.mode]
         if math.isnan(self.beta):
             raise GuideError("guide: beta is nan, expected a number")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rounds:
-    """What a guide makes of one task."""
-
-    allowed: tuple[frozenset[str], ...]
-    """What each round may move; the search ends with the first that finds a plan."""
-    scores: Mapping[str, float] | None
-    """By which the search goes through the objects; None: by index."""
+        if self.patience < 0:
+            raise GuideError(f"guide: patience is {self.patience}, expected 0 or more")
 
 
 def rounds(
     everything: frozenset[str], goal: Goal, guide: Guide | None, scores: Mapping[str, float]
-) -> Rounds:
-    """The rounds of a guide for one task; scores as `ask` gives them."""
+) -> tuple[frozenset[str], ...]:
+    """What each round of a guide may move, one round after the other until one finds a plan; scores
+    as `ask` gives them."""
     if guide is None:
-        return Rounds(allowed=(everything,), scores=None)
-    mode = GUIDES[guide.mode]
+        return (everything,)
     always = everything & {goal.subject, goal.reference}
     kept = always | {name for name in everything if scores and scores[name] > -guide.beta}
-    return Rounds(
-        allowed=tuple(mode.rounds(everything, kept, scores)),
-        scores=scores if mode.ordered else None,
-    )
+    return tuple(GUIDES[guide.mode].rounds(everything, kept, scores))
 
 
 def ask(guide: Guide | None, scene: Scene, goal: Goal) -> Mapping[str, float]:

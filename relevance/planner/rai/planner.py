@@ -165,10 +165,11 @@ def plan_rai(
 ) -> PlanResult:
     """Plan with rai's LGP solver in a subprocess; the result is of the same type as `plan`'s.
 
-    A guide restricts what rai may move (`order` has no effect on it); its last round has the
-    whole seconds. `seconds.total` is the CPU time of the subprocess without loading Python and
-    rai; counts are rai's waypoint problems (keyframe), motif samples (pose), motions (path) and
-    action sequences (nodes). `check_ok` stays False: rai's plans are for the replay to judge.
+    A guide restricts what rai may move (those that order the search have no effect on it); its
+    last round has the whole seconds. `seconds.total` is the CPU time of the subprocess without
+    loading Python and rai; counts are rai's waypoint problems (keyframe), motif samples (pose),
+    motions (path) and action sequences (nodes). `check_ok` stays False: rai's plans are for the
+    replay to judge.
     Raises PeerError where rai is missing, SceneError for an unknown predicate or object.
     """
     require_rai()
@@ -189,7 +190,7 @@ def _plan(
             goal=goal, status="solved", final={}, cost=0.0, counts=Counts(), seconds=Seconds()
         )
     scores = ask(guide, scene, goal)
-    *early, last = rounds(everything, goal, guide, scores).allowed
+    *early, last = rounds(everything, goal, guide, scores)
     spent, end = _Spent(), config.seconds
     for allowed in early:  # these share the seconds, the last round has them whole
         result = _attempt(scene, goal, allowed, config, spent, end)
