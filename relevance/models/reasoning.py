@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from relevance.models.layers import Attention, columns, pick
-from relevance.models.poses import ANGLES, GEOMETRY
+from relevance.networks import ANGLES, GEOMETRY
 from relevance.scene import Predicate, Robot
 
 ROBOT = Robot()
@@ -40,7 +40,9 @@ class Reasoning(nn.Module):
         features = goal_features(geometry, predicate, goals)
         x_BGND = tokens[:, None] + self.place(features) + self.predicate[predicate.name]
         x = x_BGND.flatten(0, 1)
-        allowed = columns(present).repeat_interleave(goals.shape[1], dim=0)
+        allowed = columns(present)
+        if allowed is not None:
+            allowed = allowed.repeat_interleave(goals.shape[1], dim=0)
         for layer in self.layers:
             x = layer(x, allowed)
         return x.view(x_BGND.shape)
@@ -74,12 +76,13 @@ def goal_features(geometry: Tensor, predicate: Predicate, goals: Tensor) -> Tens
     objects, count = place.shape[1], goals.shape[1]
     own = place[:, None].expand(-1, count, -1, -1)
     roles = torch.arange(objects, device=goals.device)[:, None] == goals[..., None, :]
-    features = [own, roles.to(place.dtype)]
-    for role in range(2):
-        anchor = pick(place, goals[..., role])[:, :, None]
-        delta = own[..., :3] - anchor[..., :3]
-        reach = (own + anchor)[..., [6, 6 + ANGLES // 2]]
-        apart = delta[..., :2].abs()
-        clear = apart - reach
-        features += [anchor.expand_as(own), delta, apart, clear, clear.amax(-1, keepdim=True)]
-    return torch.cat(features, dim=-1)
+    # Both roles at once, on an axis before the last.
+    own_BGN1 = own[..., None, :]
+    anchor = pick(place, goals.flatten(1)).unflatten(1, (count, 2))[:, :, None]
+    delta = own_BGN1[..., :3] - anchor[..., :3]
+    reach = (own_BGN1 + anchor)[..., [6, 6 + ANGLES // 2]]
+    apart = delta[..., :2].abs()
+    clear = apart - reach
+    anchor = anchor.expand(-1, -1, objects, -1, -1)
+    by_role = torch.cat([anchor, delta, apart, clear, clear.amax(-1, keepdim=True)], dim=-1)
+    return torch.cat([own, roles.to(place.dtype), by_role.flatten(-2)], dim=-1)

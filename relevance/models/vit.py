@@ -98,6 +98,7 @@ class ViTBody(Body):
         super().__init__()
         width = config.width
         self.attention = config.attention
+        self.traced = config.attention == "shared"  # else trios are drawn by what is asked
         self.patches = (config.camera.height // PATCH) * (config.camera.width // PATCH)
         self.embed = _stem(width) if config.stem else nn.Conv2d(3, width, PATCH, stride=PATCH)
         self.positions = nn.Parameter(0.02 * torch.randn(1 + self.patches, width))

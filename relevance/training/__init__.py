@@ -13,11 +13,10 @@ What is unusual here:
   `on-the-left` and `on-the-right`, and exchanging colour channels changes no geometry.
 """
 
+from relevance.networks import CHECKPOINT_VERSION, CheckpointError, shipped
 from relevance.training.budget import one_core, steps_within
 from relevance.training.catalogue import Catalogue
 from relevance.training.checkpoints import (
-    CHECKPOINT_VERSION,
-    CheckpointError,
     age,
     checkpoint_id,
     find_checkpoint,
@@ -25,7 +24,6 @@ from relevance.training.checkpoints import (
     newest_checkpoint,
     pick_device,
     save_checkpoint,
-    shipped,
     write_row,
 )
 from relevance.training.examples import Answer, Batch, Example, batch_of
