@@ -207,8 +207,11 @@ class Taught(nn.Module):
 
 
 def pick(x: Tensor, index: Tensor) -> Tensor:
-    """Rows of x (B, N, D) at index (B, G): (B, G, D)."""
-    return x.gather(1, index[..., None].expand(-1, -1, x.shape[-1]))
+    """Rows of x (B, N, D) at index (B, ...): (B, ..., D)."""
+    if tracing():
+        return x[0][index]
+    rows = x.gather(1, index.flatten(1)[..., None].expand(-1, -1, x.shape[-1]))
+    return rows.view(*index.shape, x.shape[-1])
 
 
 def columns(present: Tensor) -> Tensor | None:

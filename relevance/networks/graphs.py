@@ -82,6 +82,7 @@ class GraphNetwork:
         self._checkpoint = checkpoint
         self._values: dict[str, onnxruntime.OrtValue] = {}
         self._sessions: dict[str, onnxruntime.InferenceSession] = {}
+        self._taken: dict[str, list[str]] = {}
         self._encode = self._session("encode")
         self._seen = [output.name for output in self._encode.get_outputs()]
         self.told = [one.name for one in self._encode.get_inputs()] == ["poses"]
@@ -104,8 +105,7 @@ class GraphNetwork:
     ) -> np.ndarray:
         """As `Network.judge`."""
         session = self._session(predicate.name)
-        wanted = {one.name for one in session.get_inputs()}
-        given = {name: value for name, value in seen.items() if name in wanted}
+        given = {name: seen[name] for name in self._taken[predicate.name]}
         (scores,) = session.run(None, given | {"goals": goals})
         return np.asarray(scores)
 
@@ -120,30 +120,33 @@ class GraphNetwork:
                     f"{self.path}: the model has no head for {name}, "
                     f"was trained on {', '.join(self.predicates)}"
                 )
-            line, _, graph = self._checkpoint.graphs[name].partition(b"\n")
+            self._sessions[name] = self._load(name)
+            inputs = (one.name for one in self._sessions[name].get_inputs())
+            self._taken[name] = [one for one in inputs if one != "goals"]
+        return self._sessions[name]
+
+    def _load(self, name: str) -> onnxruntime.InferenceSession:
+        line, _, graph = self._checkpoint.graphs[name].partition(b"\n")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 4  # what goes wrong is raised
+        try:
             said = json.loads(line)
-            if said["version"] != GRAPHS_VERSION:
-                raise CheckpointError(
-                    f"{self.path}: its graphs are of version {said['version']}, "
-                    f"expected {GRAPHS_VERSION}"
-                )
-            options = onnxruntime.SessionOptions()
-            options.intra_op_num_threads = options.inter_op_num_threads = 1
-            options.log_severity_level = 4  # what goes wrong is raised
-            try:
-                weights = [self._weight(weight) for weight in said["weights"]]
-                options.add_external_initializers(said["weights"], weights)
-                self._sessions[name] = onnxruntime.InferenceSession(
+            version, names = said["version"], said["weights"]
+            options.add_external_initializers(names, [self._weight(weight) for weight in names])
+            if version == GRAPHS_VERSION:
+                return onnxruntime.InferenceSession(
                     graph, options, providers=["CPUExecutionProvider"]
                 )
-            # It has an error of its own for each of its codes, all of them derived from this one.
-            except Exception as error:
-                reason = " ".join(str(error).split())
-                raise CheckpointError(
-                    f"{self.path}: its graph {name} does not fit its weights or this ONNX Runtime "
-                    f"{onnxruntime.__version__} ({reason[:200]})"
-                ) from None
-        return self._sessions[name]
+        except Exception as error:  # ONNX Runtime's have no common class of their own
+            reason = " ".join(str(error).split())
+            raise CheckpointError(
+                f"{self.path}: its graph {name} does not fit its weights or this ONNX Runtime, "
+                f"{onnxruntime.__version__} ({reason[:200]})"
+            ) from None
+        raise CheckpointError(
+            f"{self.path}: its graphs are of version {version}, expected {GRAPHS_VERSION}"
+        )
 
     def _weight(self, name: str) -> onnxruntime.OrtValue:
         """A weight in float32, as all graphs that take it share it."""
