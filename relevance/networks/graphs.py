@@ -80,6 +80,9 @@ class GraphNetwork:
         self.camera = Camera(**config.get("camera", {}))
         self.predicates = tuple(checkpoint.meta["predicates"])
         self._checkpoint = checkpoint
+        for name, values in checkpoint.weights.items():
+            if not np.isfinite(values).all():
+                raise CheckpointError(f"{path}: {name} is not finite, expected numbers")
         self._values: dict[str, onnxruntime.OrtValue] = {}
         self._sessions: dict[str, onnxruntime.InferenceSession] = {}
         self._taken: dict[str, list[str]] = {}

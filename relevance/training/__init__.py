@@ -27,6 +27,7 @@ from relevance.training.checkpoints import (
     write_row,
 )
 from relevance.training.examples import Answer, Batch, Example, batch_of
+from relevance.training.looking import Looks, compare_looks, graphs_of
 from relevance.training.losses import batch_loss, relevance_loss
 from relevance.training.polling import polling
 from relevance.training.ranks import Ranks
@@ -44,6 +45,7 @@ __all__ = [
     "Catalogue",
     "CheckpointError",
     "Example",
+    "Looks",
     "Ranks",
     "Reader",
     "Speed",
@@ -54,7 +56,9 @@ __all__ = [
     "batch_loss",
     "batch_of",
     "checkpoint_id",
+    "compare_looks",
     "find_checkpoint",
+    "graphs_of",
     "load_checkpoint",
     "measure",
     "measure_speed",
