@@ -23,6 +23,7 @@ ORDER = (
     "robot",
     "scene",
     "store",
+    "networks",
     "sampling",
     "simulation",
     "planner",

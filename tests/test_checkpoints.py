@@ -233,7 +233,7 @@ def refused(path: Path) -> str:
     message = str(error.value)
     assert str(path) in message
     assert "\n" not in message
-    assert "expected a checkpoint of version 2" in message
+    assert "expected a checkpoint of version 3" in message
     return message
 
 
@@ -273,8 +273,8 @@ def test_files_that_are_no_checkpoints(whole: Path, tmp_path: Path) -> None:
     for content in (b"red,blue\n1,2\n", b"relevance-checkpoint 7\n", b"relevance-checkpoint {\n"):
         path.write_bytes(content)
         assert "not a checkpoint" in refused(path)
-    path.write_bytes(whole.read_bytes().replace(b'"version": 2', b'"version": 3', 1))
-    assert "is of version 3" in refused(path)
+    path.write_bytes(whole.read_bytes().replace(b'"version": 3', b'"version": 4', 1))
+    assert "is of version 4" in refused(path)
     torch.save({"version": 1}, path)
     assert "not a checkpoint" in refused(path)
     write_file(path, "state", {"done": 1})

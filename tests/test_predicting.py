@@ -15,7 +15,7 @@ from relevance.cli import main
 from relevance.evaluation import load_scorer
 from relevance.evaluation.pictures import judge, look_at
 from relevance.models import BODIES, RelevanceModel
-from relevance.scene import Goal
+from relevance.scene import PREDICATES, Goal
 from relevance.training import TrainConfig, save_checkpoint
 
 GOAL = "on-the-left(red, blue)"
@@ -72,13 +72,9 @@ def test_scores_are_the_models(files: Files, capsys: pytest.CaptureFixture[str])
     names = [row["object"] for row in rows]
     assert names == sorted(CROPS)
     views = np.stack([picture[y : y + h, x : x + w] for x, y, w, h in map(CROPS.get, names)])
-    pair = torch.tensor([[[names.index("red"), names.index("blue")]]])
-    with torch.inference_mode():
-        encoding = scorer.model.encode(
-            torch.from_numpy(picture).permute(2, 0, 1)[None],
-            torch.from_numpy(views).permute(0, 3, 1, 2)[None],
-        )
-        expected = scorer.model.decode(encoding, "on-the-left", pair)[0, 0].tolist()
+    pair = np.array([[names.index("red"), names.index("blue")]])
+    seen = scorer.model.look(picture, views, None)
+    expected = scorer.model.judge(seen, PREDICATES["on-the-left"], pair)[0].tolist()
     assert [row["score"] for row in rows] == pytest.approx(expected, abs=1e-4)
     for row in rows:
         assert row["probability"] == pytest.approx(1 / (1 + np.exp(-row["score"])), abs=1e-3)

@@ -11,7 +11,8 @@ from ruled import ruled
 
 import relevance
 from relevance.cli import main
-from relevance.models import RelevanceModel
+from relevance.evaluation import NetworkScorer
+from relevance.networks import GraphNetwork
 from relevance.training import (
     CheckpointError,
     TrainConfig,
@@ -65,8 +66,9 @@ def test_trained_models_are_not_trained_again(root: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize("name", ["glimpse", "geometry"])
 def test_models_that_ship_are_found_by_name(name: str, root: Path) -> None:
     guide = relevance.load_guide(name)
-    assert isinstance(guide.scorer.model, RelevanceModel)  # pyright: ignore
-    assert guide.scorer.model.config.body == name  # pyright: ignore
+    assert isinstance(guide.scorer, NetworkScorer)
+    assert isinstance(guide.scorer.model, GraphNetwork)
+    assert guide.scorer.model.body_name == name
     assert find_checkpoint(root, name) == shipped()[name]
     assert shipped()[name].with_suffix(".md").exists()
 

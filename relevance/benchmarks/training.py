@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 from relevance.benchmarks.runs import Measured, Progress
-from relevance.models import BODIES, ModelConfig
+from relevance.models import BODIES, ModelConfig, RelevanceModel
+from relevance.networks import named
 from relevance.report.tables import Table
-from relevance.training import Speed, TrainConfig, measure_speed
+from relevance.training import (
+    Looks,
+    Speed,
+    TrainConfig,
+    compare_looks,
+    graphs_of,
+    load_checkpoint,
+    measure_speed,
+    shipped,
+)
 
 Sizes = Literal["cpu", "paper"]
 """Widths that a CPU can train (the defaults), or the paper's."""
@@ -57,7 +67,10 @@ def measure_training(
     return Measured(
         name="training",
         rows=tuple(rows),
-        tables=(_table(rows, f"{scenes} scenes of {goals} goals and {objects} objects"),),
+        tables=(
+            _table(rows, f"{scenes} scenes of {goals} goals and {objects} objects"),
+            _looks_table(list(_looks(chosen, sizes=(3, 10, 30)))),
+        ),
     )
 
 
@@ -72,6 +85,54 @@ def _configs(sizes: Sequence[Sizes], bodies: Sequence[str]) -> list[tuple[str, S
             for reading, model in config.readings().items():
                 found.append((f"{body} {reading}".strip(), size, model))
     return found
+
+
+def _looks(
+    chosen: Sequence[tuple[str, Sizes, ModelConfig]], sizes: Sequence[int]
+) -> Iterator[tuple[str, Looks]]:
+    """Each body that has graphs, in torch and in ONNX Runtime: the shipped network where its sizes
+    are asked for, else fresh weights."""
+    for body, _, config in chosen:
+        model = RelevanceModel(config, ["on-the-left"]).eval()
+        if body in shipped():
+            known, _meta = load_checkpoint(named(body), "cpu")
+            model = known if known.config == config else model
+        graphs = graphs_of(model)
+        if graphs is not None:
+            for looks in compare_looks(model, graphs, sizes=sizes):
+                yield body, looks
+
+
+def _looks_table(rows: Sequence[tuple[str, Looks]]) -> Table:
+    return Table(
+        name="looks",
+        title="A look in ONNX Runtime against torch, CPU ms on one thread each, in turns (medians)",
+        columns=(
+            "body",
+            "objects",
+            "scene, torch",
+            "scene, ONNX",
+            "ratio",
+            "goal, torch",
+            "goal, ONNX",
+            "ratio of goals",
+            "scores differ by",
+        ),
+        rows=tuple(
+            (
+                body,
+                str(looks.objects),
+                f"{1e3 * looks.encode_torch:.2f}",
+                f"{1e3 * looks.encode_graph:.2f}",
+                f"{looks.encode_ratio:.2f}",
+                f"{1e3 * looks.goal_torch:.2f}",
+                f"{1e3 * looks.goal_graph:.2f}",
+                f"{looks.goal_ratio:.2f}",
+                f"{looks.off:.0e}",
+            )
+            for body, looks in rows
+        ),
+    )
 
 
 def _table(rows: Sequence[Trained], batch: str) -> Table:

@@ -9,13 +9,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from relevance.errors import RelevanceError
 from relevance.evaluation.scorer import NetworkScorer
-from relevance.scene import Camera, Goal, project
+from relevance.networks import DECIMETRE
+from relevance.scene import Goal, project
 from relevance.scene.words import normal
 from relevance.store import VIEW_SIZE, locate, replacing
 
@@ -160,8 +162,8 @@ def _read_views(folder: Path) -> dict[str, np.ndarray]:
 
 
 def _refuse(scorer: NetworkScorer, seen: Seen, goals: Sequence[Goal]) -> None:
-    model, camera = scorer.model, scorer.model.config.camera
-    name = scorer.checkpoint_id or model.config.body
+    model, camera = scorer.model, scorer.model.camera
+    name = scorer.checkpoint_id or model.body_name
     if model.told:
         raise PictureError(f"{name}: is told where objects are, expected a model that looks")
     height, width = seen.image.shape[:2]
@@ -176,25 +178,17 @@ def _refuse(scorer: NetworkScorer, seen: Seen, goals: Sequence[Goal]) -> None:
                 raise PictureError(f"goal {goal}: no view of {role}, expected one of {known}")
 
 
-def _tensors(seen: Seen) -> tuple:
-    import torch
-
-    views = torch.from_numpy(np.stack(list(seen.views.values()))).permute(0, 3, 1, 2)
-    return torch.from_numpy(seen.image).permute(2, 0, 1)[None], views[None]
+def _look(scorer: NetworkScorer, seen: Seen) -> Any:
+    return scorer.model.look(seen.image, np.stack(list(seen.views.values())), None)
 
 
 def _scores(scorer: NetworkScorer, seen: Seen, goals: Sequence[Goal]) -> np.ndarray:
     """Scores (G, N), the checkpoint's offsets added."""
-    import torch
-
     names, model = list(seen.views), scorer.model
-    scores = np.empty((len(goals), len(names)))
-    with torch.inference_mode():
-        encoding = model.encode(*_tensors(seen))
-        for row, goal in zip(scores, goals, strict=True):
-            pair = torch.tensor([[[names.index(goal.subject), names.index(goal.reference)]]])
-            logits = model.decode(encoding, goal.predicate, pair)[0, 0].cpu().numpy()
-            row[:] = logits + scorer.offset(goal.predicate)
+    scores, looked = np.empty((len(goals), len(names))), _look(scorer, seen)
+    for row, goal in zip(scores, goals, strict=True):
+        pair = np.array([[names.index(goal.subject), names.index(goal.reference)]])
+        row[:] = model.judge(looked, goal.predicate, pair)[0] + scorer.offset(goal.predicate)
     if not np.isfinite(scores).all():
         raise PictureError(f"{scorer.checkpoint_id}: its scores are not finite, expected numbers")
     return scores
@@ -202,19 +196,14 @@ def _scores(scorer: NetworkScorer, seen: Seen, goals: Sequence[Goal]) -> np.ndar
 
 def _believed(scorer: NetworkScorer, seen: Seen) -> list[tuple[str, Crop]]:
     """Where objects are: what was cut out, else a spot where the model believes the centre."""
-    import torch
-
-    from relevance.models import DECIMETRE
-
-    camera: Camera = scorer.model.config.camera
-    with torch.inference_mode():
-        geometry = scorer.model.encode(*_tensors(seen)).geometry
+    camera = scorer.model.camera
+    geometry = scorer.model.believed(_look(scorer, seen))
     found = []
     for place, name in enumerate(seen.views):
         if name in seen.crops:
             found.append((name, seen.crops[name]))
         elif geometry is not None:
-            position = geometry[0, place, :3].double().cpu().numpy() * DECIMETRE
+            position = geometry[place, :3].astype(float) * DECIMETRE
             (u, v), depth = project(camera, position)
             if depth > 0 and 0 <= u < camera.width and 0 <= v < camera.height:
                 found.append((name, (round(float(u)) - 5, round(float(v)) - 5, 10, 10)))

@@ -14,19 +14,16 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from relevance.errors import RelevanceError, RelevanceWarning
+from relevance.networks import GraphNetwork, Network, named, read_checkpoint, true_geometry
 from relevance.planner import Guide
 from relevance.sampling import same_view, view_of
 from relevance.scene import Goal, Predicate, Scene, lookalikes
 from relevance.store import Dataset
-
-if TYPE_CHECKING:  # models imports torch, which the planner and the report do without
-    from relevance.models import RelevanceModel
-
 
 _SAME_YAW = math.radians(1)
 
@@ -46,7 +43,7 @@ class NetworkScorer:
 
     def __init__(
         self,
-        model: RelevanceModel,
+        model: Network,
         *,
         checkpoint_id: str = "",
         policy: str = "found",
@@ -73,7 +70,7 @@ class NetworkScorer:
     def observe(self, scene: Scene, image: np.ndarray, views: np.ndarray) -> None:
         """Give a scene's image (H, W, 3) and its objects' views (N, 32, 32, 3), uint8 RGB."""
         self._check(scene)
-        wanted = self.model.config.camera
+        wanted = self.model.camera
         if image.shape[:2] != (wanted.height, wanted.width):
             raise EvaluationError(
                 f"scene {scene.id}: image is {image.shape[1]}x{image.shape[0]}, "
@@ -113,33 +110,20 @@ class NetworkScorer:
             with Renderer() as renderer:
                 rendering = renderer.render(scene)
             self.observe(scene, rendering.image, rendering.views)
-        import torch
-
-        from relevance.models import true_geometry
-
         start = time.process_time()
-        device = next(self.model.parameters()).device
-        with torch.inference_mode():
-            if key not in self._encodings:
-                image, views = (torch.from_numpy(p).to(device) for p in self._seen[key])
-                poses = torch.from_numpy(true_geometry(scene)).to(device)[None]
-                encoding = self.model.encode(
-                    image.permute(2, 0, 1)[None],
-                    views.permute(0, 3, 1, 2)[None],
-                    poses=poses if self.model.told else None,
-                )
-                self._keep(self._encodings, key, encoding)
-            encoding = self._encodings[key]
-            scores = np.empty((len(goals), len(scene.objects)))
-            for predicate in dict.fromkeys(goal.predicate for goal in goals):
-                which = [n for n, goal in enumerate(goals) if goal.predicate == predicate]
-                pairs = [
-                    [scene.names.index(name) for name in (goals[n].subject, goals[n].reference)]
-                    for n in which
-                ]
-                asked = torch.tensor([pairs], device=device)
-                logits = self.model.decode(encoding, predicate, asked)[0].cpu()
-                scores[which] = logits.double() + self.offset(predicate)
+        if key not in self._encodings:
+            poses = true_geometry(scene) if self.model.told else None
+            self._keep(self._encodings, key, self.model.look(*self._seen[key], poses))
+        encoding = self._encodings[key]
+        scores = np.empty((len(goals), len(scene.objects)))
+        for predicate in dict.fromkeys(goal.predicate for goal in goals):
+            which = [n for n, goal in enumerate(goals) if goal.predicate == predicate]
+            pairs = [
+                [scene.names.index(name) for name in (goals[n].subject, goals[n].reference)]
+                for n in which
+            ]
+            logits = self.model.judge(encoding, predicate, np.array(pairs))
+            scores[which] = logits.astype(float) + self.offset(predicate)
         self.seconds = time.process_time() - start
         if not np.isfinite(scores).all():
             raise EvaluationError(
@@ -151,7 +135,7 @@ class NetworkScorer:
     def _check(self, scene: Scene) -> None:
         """Refuse a robot turned otherwise and a picture of another size; warn of another camera
         and of lookalikes."""
-        mine, its = self.model.config.camera, scene.camera
+        mine, its = self.model.camera, scene.camera
         turns = (math.remainder(scene.robot.yaw - yaw, math.tau) for yaw in self.yaws)
         if not any(abs(turn) < _SAME_YAW for turn in turns):
             learned = ", ".join(f"{yaw:g}" for yaw in self.yaws)
@@ -197,9 +181,17 @@ def warn(message: str) -> None:
 
 def open_checkpoint(checkpoint: str | Path) -> tuple[NetworkScorer, dict[str, Any]]:
     """A checkpoint's scorer, and what is known of it (id, config, metrics, hashes)."""
-    from relevance.training import load_checkpoint
+    path = named(checkpoint)
+    found = read_checkpoint(path)
+    meta = found.meta
+    model: Network
+    if found.graphs:
+        model = GraphNetwork(found, path)
+    else:
+        from relevance.training import load_checkpoint  # torch: only where nothing else runs it
 
-    model, meta = load_checkpoint(checkpoint)
+        model, meta = load_checkpoint(path)
+        warn(f"{path}: body {model.body_name} has no graph for ONNX Runtime, it runs in torch")
     scorer = NetworkScorer(
         model,
         checkpoint_id=meta["checkpoint_id"],

@@ -21,15 +21,9 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from relevance.models.config import PATCH, STRIDE, Answer, Encoding, ModelConfig, ModelError, Sight
+from relevance.models.graphs import export_graphs
 from relevance.models.layers import Attention, Extractor
-from relevance.models.poses import (
-    ANGLES,
-    DECIMETRE,
-    GEOMETRY,
-    half_extents,
-    mirrored,
-    true_geometry,
-)
+from relevance.models.poses import half_extents, mirrored
 from relevance.models.registry import (
     BODIES,
     Body,
@@ -38,6 +32,7 @@ from relevance.models.registry import (
     model_config,
     unequal,
 )
+from relevance.networks import ANGLES, DECIMETRE, GEOMETRY, true_geometry
 
 for _module in iter_modules(__path__):
     import_module(f"{__name__}.{_module.name}")
@@ -59,6 +54,7 @@ __all__ = [
     "ModelError",
     "RelevanceModel",
     "Sight",
+    "export_graphs",
     "half_extents",
     "mirrored",
     "model_config",

@@ -17,9 +17,9 @@ from torch import Tensor, nn
 from relevance.configs import config
 from relevance.models.config import Answer, Encoding, ModelConfig, divides
 from relevance.models.layers import Attention, columns
-from relevance.models.poses import GEOMETRY
 from relevance.models.reasoning import Reasoning, object_heads
 from relevance.models.registry import BODIES, Body, BodyKind
+from relevance.networks import GEOMETRY
 from relevance.scene import Predicate
 
 

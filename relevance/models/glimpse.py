@@ -18,9 +18,10 @@ from torch.nn import functional as F
 from relevance.configs import config
 from relevance.models.config import PATCH, STRIDE, Answer, Encoding, ModelConfig, Sight, divides
 from relevance.models.layers import Attention, columns, small_cnn
-from relevance.models.poses import DECIMETRE, GEOMETRY
 from relevance.models.reasoning import Reasoning, object_heads
 from relevance.models.registry import BODIES, Body, BodyKind
+from relevance.models.tracing import sums, tracing, unshuffled, windows
+from relevance.networks import DECIMETRE, GEOMETRY
 from relevance.scene import Camera, Predicate, camera_up
 
 _GROUND = 0.035
@@ -99,13 +100,13 @@ class GlimpseBody(Body):
     ) -> Encoding:
         """As `RelevanceModel.encode`, inputs float in 0..1."""
         batch, objects = views.shape[:2]
-        features_BEP = self.scene(image - 0.5).flatten(2)
+        features_BEP = self._features(image).flatten(2)
         view_BND = self.view((views - 0.5).flatten(0, 1)).view(batch, objects, -1)
         key_BNE = self.view_key(view_BND)
         with torch.autocast(image.device.type, enabled=False):
             # Cosine similarity; positions are read to a fraction of a pixel, hence float32.
             features_BEP = features_BEP.float()
-            norm_B1P = features_BEP.square().sum(1, keepdim=True).clamp(min=1e-6).rsqrt()
+            norm_B1P = sums(features_BEP.square()).clamp(min=1e-6).rsqrt()
             key_BNE = F.normalize(key_BNE.float(), dim=-1) * self.sharpness.exp()
             match_BNP = key_BNE @ features_BEP * norm_B1P
             where_BNP = match_BNP.softmax(-1)
@@ -127,10 +128,20 @@ class GlimpseBody(Body):
             )
         return Encoding(tokens=tokens, present=present, geometry=geometry, sight=sight)
 
+    def _features(self, image: Tensor) -> Tensor:
+        """The stride-4 feature map, (B, E, h, w)."""
+        return unshuffled(self.scene, image) if tracing() else self.scene(image - 0.5)
+
     def _window(self, image: Tensor, where_BNP: Tensor, centre_BN2: Tensor) -> Tensor:
         """Windows around the centres, (B*N, 4, 32, 32): colours and match map."""
         batch, objects = where_BNP.shape[:2]
         height, width = image.shape[-2:]
+        if tracing():
+            map_NHW = where_BNP[0].unflatten(-1, (height // STRIDE, width // STRIDE))
+            peak, _ = windows(map_NHW[:, None], centre_BN2[0], self.window / STRIDE, own=True)
+            colours, inside = windows(image, centre_BN2[0], self.window, own=False)
+            highest = where_BNP[0].amax(-1)[:, None, None, None]
+            return torch.cat([colours - inside / 2, peak / highest], dim=1)
         step = (torch.arange(PATCH, device=image.device) + 0.5) / PATCH * 2 - 1
         offset = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1)
         offset = offset * offset.new_tensor([self.window / width, self.window / height])

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from relevance.models.config import PATCH, Answer, Sight
-from relevance.models.poses import GEOMETRY
+from relevance.models.tracing import attend, tracing
+from relevance.networks import GEOMETRY
 from relevance.scene import Camera
 
 
@@ -32,6 +33,9 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor, allowed: Tensor | None = None) -> Tensor:
         """x (B, L, D); allowed (B or 1, L, L) bool: row may look at column (None: at all)."""
+        if tracing() and allowed is None:
+            x = x + self.out(attend(self.norm_in(x), self.qkv, self.heads))
+            return x + self.mlp(self.norm_mid(x))
         batch, length, width = x.shape
         qkv = self.qkv(self.norm_in(x)).view(batch, length, 3, self.heads, width // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)
@@ -203,11 +207,19 @@ class Taught(nn.Module):
 
 
 def pick(x: Tensor, index: Tensor) -> Tensor:
-    """Rows of x (B, N, D) at index (B, G): (B, G, D)."""
-    return x.gather(1, index[..., None].expand(-1, -1, x.shape[-1]))
+    """Rows of x (B, N, D) at index (B, ...): (B, ..., D)."""
+    if tracing():
+        return x[0][index]
+    rows = x.gather(1, index.flatten(1)[..., None].expand(-1, -1, x.shape[-1]))
+    return rows.view(*index.shape, x.shape[-1])
 
 
-def columns(present: Tensor) -> Tensor:
-    """Attention mask (B, N, N): everyone may look at the objects that exist, and at itself."""
+def columns(present: Tensor) -> Tensor | None:
+    """Attention mask (B, N, N): everyone may look at the objects that exist, and at itself.
+
+    None while a graph is traced: there all objects exist.
+    """
+    if tracing():
+        return None
     itself = torch.eye(present.shape[1], dtype=torch.bool, device=present.device)
     return present[:, None, :] | itself

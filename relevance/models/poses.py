@@ -1,26 +1,16 @@
-"""Where a box is as networks are told it or asked for it: position, size, half-extents.
+"""Geometry of boxes (`relevance.networks.true_geometry`) as tensors: batches of it, and its mirror.
 
-Geometry is in decimetres, so that its numbers are near 1.
-
-Shape suffixes: N objects of a scene; GEOMETRY is the last axis of whatever comes in.
+Shape suffixes: GEOMETRY is the last axis of whatever comes in.
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from relevance.scene import Scene
-
-ANGLES = 8
-"""Directions over a half turn along which footprint half-extents are regressed."""
-GEOMETRY = 3 + 3 + ANGLES
-"""Position (3), size (3), half-extents (ANGLES), all in decimetres."""
-DECIMETRE = 0.1
-"""Metres per unit of the geometry vectors."""
+from relevance.networks import ANGLES, GEOMETRY
 
 
 def half_extents(size_x: Tensor, size_y: Tensor, yaw: Tensor) -> Tensor:
@@ -40,12 +30,3 @@ def mirrored(geometry: Tensor) -> Tensor:
     sign[1] = -1
     order = [*range(6), *(6 + (ANGLES - k) % ANGLES for k in range(ANGLES))]
     return (geometry * sign)[..., order]
-
-
-def true_geometry(scene: Scene) -> np.ndarray:
-    """Position, size and footprint half-extents of every box, (N, GEOMETRY), decimetres."""
-    size = torch.tensor([box.size for box in scene.objects], dtype=torch.float64)
-    yaw = torch.tensor([box.yaw for box in scene.objects], dtype=torch.float64)
-    position = torch.tensor([box.position for box in scene.objects], dtype=torch.float64)
-    extents = half_extents(size[:, 0], size[:, 1], yaw)
-    return (torch.cat([position, size, extents], dim=1) / DECIMETRE).numpy().astype(np.float32)

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from relevance.models.layers import Attention, columns, pick
-from relevance.models.poses import ANGLES, GEOMETRY
+from relevance.models.tracing import tracing
+from relevance.networks import ANGLES, GEOMETRY
 from relevance.scene import Predicate, Robot
 
 ROBOT = Robot()
@@ -39,11 +40,13 @@ class Reasoning(nn.Module):
         """Tokens (B, G, N, D) from tokens (B, N, D) and geometry (B, N, GEOMETRY)."""
         features = goal_features(geometry, predicate, goals)
         x_BGND = tokens[:, None] + self.place(features) + self.predicate[predicate.name]
-        x = x_BGND.flatten(0, 1)
-        allowed = columns(present).repeat_interleave(goals.shape[1], dim=0)
+        x = x_BGND[0] if tracing() else x_BGND.flatten(0, 1)
+        allowed = columns(present)
+        if allowed is not None:
+            allowed = allowed.repeat_interleave(goals.shape[1], dim=0)
         for layer in self.layers:
             x = layer(x, allowed)
-        return x.view(x_BGND.shape)
+        return x[None] if tracing() else x.view(x_BGND.shape)
 
 
 def object_heads(width: int, predicates: Sequence[str]) -> nn.ModuleDict:
@@ -71,15 +74,14 @@ def goal_features(geometry: Tensor, predicate: Predicate, goals: Tensor) -> Tens
     turn = round(math.atan2(u[1], u[0]) / (math.pi / ANGLES))
     extents = geometry[..., 6:].roll(-turn, dims=-1)
     place = torch.cat([geometry[..., :2] @ axes.T, geometry[..., 2:6], extents], dim=-1)
-    objects, count = place.shape[1], goals.shape[1]
-    own = place[:, None].expand(-1, count, -1, -1)
-    roles = torch.arange(objects, device=goals.device)[:, None] == goals[..., None, :]
-    features = [own, roles.to(place.dtype)]
-    for role in range(2):
-        anchor = pick(place, goals[..., role])[:, :, None]
-        delta = own[..., :3] - anchor[..., :3]
-        reach = (own + anchor)[..., [6, 6 + ANGLES // 2]]
-        apart = delta[..., :2].abs()
-        clear = apart - reach
-        features += [anchor.expand_as(own), delta, apart, clear, clear.amax(-1, keepdim=True)]
-    return torch.cat(features, dim=-1)
+    roles = torch.arange(place.shape[1], device=goals.device)[:, None] == goals[..., None, :]
+    # Both roles at once, on an axis before the last.
+    own, anchor = place[:, None, :, None], pick(place, goals)[:, :, None]
+    both = own + anchor
+    delta = own[..., :3] - anchor[..., :3]
+    apart = delta[..., :2].abs()
+    clear = apart - both[..., [6, 6 + ANGLES // 2]]
+    by_role = [anchor.expand_as(both), delta, apart, clear, clear.amax(-1, keepdim=True)]
+    subject, reference = torch.cat(by_role, dim=-1).unbind(-2)
+    own = own.expand_as(both)[..., 0, :]
+    return torch.cat([own, roles.to(place.dtype), subject, reference], dim=-1)

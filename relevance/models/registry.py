@@ -13,12 +13,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from relevance.models.config import Answer, Encoding, ModelConfig, ModelError
 from relevance.registry import Registry
-from relevance.scene import PREDICATES, Predicate
+from relevance.scene import PREDICATES, Camera, Predicate
 
 
 class Body(nn.Module, ABC):
@@ -33,6 +34,9 @@ class Body(nn.Module, ABC):
 
     among_all = False
     """Whether a score depends on all objects of the scene, not on the three views alone."""
+
+    traced = True
+    """Whether ONNX Runtime gets a graph of it, where one can be made."""
 
     @abstractmethod
     def encode(
@@ -87,6 +91,16 @@ class RelevanceModel(nn.Module):
     def device(self) -> torch.device:
         """Where the weights are; every input is brought there."""
         return next(self.parameters()).device
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that it learns from."""
+        return self.config.camera
+
+    @property
+    def body_name(self) -> str:
+        """glimpse, vit, ..."""
+        return self.config.body
 
     @property
     def told(self) -> bool:
@@ -158,6 +172,26 @@ class RelevanceModel(nn.Module):
         asked = asked.to(goals.device)
         answer = self.body.decode(encoding, PREDICATES[name], goals, asked)
         return replace(answer, scores=answer.scores.float())
+
+    # --- as `relevance.networks.Network` has it, numpy in and out ---
+
+    @torch.inference_mode()
+    def look(self, image: np.ndarray, views: np.ndarray, poses: np.ndarray | None) -> Encoding:
+        """As `Network.look`."""
+        return self.encode(
+            torch.from_numpy(image).permute(2, 0, 1)[None],
+            torch.from_numpy(views).permute(0, 3, 1, 2)[None],
+            poses=None if poses is None else torch.from_numpy(poses)[None],
+        )
+
+    @torch.inference_mode()
+    def judge(self, seen: Encoding, predicate: Predicate, goals: np.ndarray) -> np.ndarray:
+        """As `Network.judge`."""
+        return self.decode(seen, predicate, torch.from_numpy(goals)[None])[0].cpu().numpy()
+
+    def believed(self, seen: Encoding) -> np.ndarray | None:
+        """As `Network.believed`."""
+        return None if seen.geometry is None else seen.geometry[0].cpu().numpy()
 
 
 def model_config(values: Any) -> Any:

@@ -89,6 +89,8 @@ class ResnetConfig(ModelConfig):
 class ResnetBody(Body):
     """Two ResNets, a dense layer to three embeddings, an extractor for each predicate."""
 
+    traced = False  # trios are drawn by what is asked
+
     def __init__(self, config: ResnetConfig, predicates: Sequence[str]) -> None:
         super().__init__()
         self.width = config.width

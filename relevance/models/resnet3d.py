@@ -71,6 +71,8 @@ class Resnet3dConfig(ModelConfig):
 class Resnet3dBody(Body):
     """One 3D ResNet, a dense layer to three embeddings, an extractor for each predicate."""
 
+    traced = False  # trios are drawn by what is asked
+
     def __init__(self, config: Resnet3dConfig, predicates: Sequence[str]) -> None:
         super().__init__()
         self.width = config.width

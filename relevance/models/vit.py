@@ -98,6 +98,7 @@ class ViTBody(Body):
         super().__init__()
         width = config.width
         self.attention = config.attention
+        self.traced = config.attention == "shared"  # else trios are drawn by what is asked
         self.patches = (config.camera.height // PATCH) * (config.camera.width // PATCH)
         self.embed = _stem(width) if config.stem else nn.Conv2d(3, width, PATCH, stride=PATCH)
         self.positions = nn.Parameter(0.02 * torch.randn(1 + self.patches, width))
@@ -158,12 +159,10 @@ class ViTBody(Body):
         """Who may look at whom, (1, L, L): patches first, then views; None where all may."""
         if self.attention == "trio":
             return None
-        allowed = torch.ones(1, length, length, dtype=torch.bool, device=device)
-        itself = torch.eye(length, dtype=torch.bool, device=device)
-        part = slice(self.patches, None) if self.attention == "shared" else slice(self.patches)
-        rows = slice(None) if self.attention == "shared" else part
-        allowed[:, rows, part] = itself[rows, part]
-        return allowed
+        place = torch.arange(length, device=device)
+        itself, patch = place[:, None] == place, place < self.patches
+        others = patch if self.attention == "shared" else ~(patch[:, None] & patch)
+        return (itself | others)[None]
 
 
 def _stem(width: int) -> nn.Sequential:

@@ -13,11 +13,10 @@ What is unusual here:
   `on-the-left` and `on-the-right`, and exchanging colour channels changes no geometry.
 """
 
+from relevance.networks import CHECKPOINT_VERSION, CheckpointError, shipped
 from relevance.training.budget import one_core, steps_within
 from relevance.training.catalogue import Catalogue
 from relevance.training.checkpoints import (
-    CHECKPOINT_VERSION,
-    CheckpointError,
     age,
     checkpoint_id,
     find_checkpoint,
@@ -25,10 +24,10 @@ from relevance.training.checkpoints import (
     newest_checkpoint,
     pick_device,
     save_checkpoint,
-    shipped,
     write_row,
 )
 from relevance.training.examples import Answer, Batch, Example, batch_of
+from relevance.training.looking import Looks, compare_looks, graphs_of
 from relevance.training.losses import batch_loss, relevance_loss
 from relevance.training.polling import polling
 from relevance.training.ranks import Ranks
@@ -46,6 +45,7 @@ __all__ = [
     "Catalogue",
     "CheckpointError",
     "Example",
+    "Looks",
     "Ranks",
     "Reader",
     "Speed",
@@ -56,7 +56,9 @@ __all__ = [
     "batch_loss",
     "batch_of",
     "checkpoint_id",
+    "compare_looks",
     "find_checkpoint",
+    "graphs_of",
     "load_checkpoint",
     "measure",
     "measure_speed",

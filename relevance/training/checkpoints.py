@@ -1,37 +1,48 @@
-"""Checkpoints: files that carry their own hash and id, their rows, and how one is found.
+"""Checkpoints as models: written with their graphs, read, entered in a dataset, and found.
 
-A file is one line of JSON (version, kind, sha256 of the rest), then what `torch.save` wrote: a
-changed, cut or foreign file is refused before anything in it is interpreted, and what is
-interpreted is tensors and plain values only. The name of a file means nothing; its id is inside.
+The name of a file means nothing; its id is inside (`relevance.networks`).
 """
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import os
 import pickle
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
-from relevance.errors import RelevanceError
+from relevance.errors import RelevanceError, RelevanceWarning
 from relevance.hashing import content_hash
-from relevance.models import RelevanceModel
-from relevance.store import Dataset, DatasetError, locate, replacing
+from relevance.models import PATCH, RelevanceModel, export_graphs
+from relevance.networks import (
+    CHECKPOINT_VERSION,
+    GEOMETRY,
+    Checkpoint,
+    CheckpointError,
+    GraphNetwork,
+    Network,
+    frame,
+    named,
+    read_checkpoint,
+    shipped,
+    unframe,
+    write_checkpoint,
+)
+from relevance.scene import PREDICATES
+from relevance.store import Dataset, DatasetError
 from relevance.training.settings import TrainConfig
 
-CHECKPOINT_VERSION = 2
-"""Version of checkpoint files; a file of another version is refused."""
-_START = b"relevance-checkpoint "
-
-
-class CheckpointError(RelevanceError):
-    """A file that is no checkpoint of this version: says which file, found and expected."""
+STATE_VERSION = 2
+"""Version of the files of unfinished runs."""
 
 
 def pick_device(choice: str = "auto") -> torch.device:
@@ -61,9 +72,48 @@ def data_hash(dataset: Dataset, config: TrainConfig) -> str:
 
 
 def save_checkpoint(path: Path, model: RelevanceModel, meta: Mapping[str, Any]) -> None:
-    """Write a model and what is known of it; the file exists whole or not at all."""
-    content = {"meta": {**meta, "predicates": list(model.predicates)}, "model": model.state_dict()}
-    write_file(path, "checkpoint", content)
+    """Write a model, what is known of it, and the graphs that run it without torch.
+
+    A body of which no graph can be made keeps torch; a RelevanceWarning says why.
+    """
+    known = {**meta, "predicates": list(model.predicates)}
+    weights = {name: value.cpu().numpy() for name, value in model.state_dict().items()}
+    made = Checkpoint(meta=known, weights=weights)
+    if model.body.traced:
+        try:
+            made = replace(made, graphs=export_graphs(model))
+            check_graphs(model, GraphNetwork(made, path))
+        except Exception as error:  # whatever a body is made of, its checkpoint is not lost
+            made = replace(made, graphs={})
+            reason = " ".join(str(error).split())
+            warnings.warn(
+                f"{path}: no graph of body {model.body_name} ({reason[:200]}), it will guide in "
+                "torch",
+                RelevanceWarning,
+                stacklevel=2,
+            )
+    write_checkpoint(path, made)
+
+
+def check_graphs(model: RelevanceModel, graphs: Network, sizes: Sequence[int] = (2, 5)) -> None:
+    """Raise CheckpointError unless graphs score made-up scenes of these sizes as their model does.
+
+    Weights that are not finite have no scores to compare.
+    """
+    rng, camera = np.random.default_rng(0), model.camera
+    plain = deepcopy(model).to("cpu").float().eval()
+    for count in sizes:
+        image = rng.integers(0, 256, (camera.height, camera.width, 3), np.uint8)
+        views = rng.integers(0, 256, (count, PATCH, PATCH, 3), np.uint8)
+        poses = rng.uniform(0, 3, (count, GEOMETRY)).astype(np.float32) if model.told else None
+        goals = np.array([[0, 1], [1, 0], [count - 1, 0]])
+        mine, its = plain.look(image, views, poses), graphs.look(image, views, poses)
+        for name in model.predicates:
+            expected = plain.judge(mine, PREDICATES[name], goals)
+            found = graphs.judge(its, PREDICATES[name], goals)
+            if not np.allclose(found, expected, rtol=1e-4, atol=1e-4, equal_nan=True):
+                off = np.abs(found - expected).max()
+                raise CheckpointError(f"its scores for {name} are off by {off:.2g}")
 
 
 def load_checkpoint(
@@ -76,12 +126,13 @@ def load_checkpoint(
     """
     path = named(path)
     where = pick_device(device) if isinstance(device, str) else device
-    content = read_file(path, "checkpoint", where)
+    found = read_checkpoint(path)
+    meta = found.meta
     try:
-        meta = content["meta"]
         config = TrainConfig.from_dict(meta["config"])
         model = RelevanceModel(config.model, meta["predicates"])
-        model.load_state_dict(content["model"])
+        weights = {name: torch.from_numpy(values) for name, values in found.weights.items()}
+        model.load_state_dict(weights)
         name = meta["checkpoint_id"]
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
@@ -95,63 +146,25 @@ def load_checkpoint(
     return model.to(where).eval(), meta
 
 
-def named(path: str | Path) -> Path:
-    """The file, where there is one, else the model of that name that comes with the package."""
-    file = locate(path)
-    return file if file.exists() else shipped().get(str(path), file)
-
-
-def shipped() -> dict[str, Path]:
-    """The models that come with the package, by name."""
-    package = Path(__file__).parents[1]
-    installed, checkout = package / "shipped", package.parent / "data" / "models"
-    folder = installed if installed.is_dir() else checkout
-    return {file.stem: file for file in sorted(folder.glob("*.pt"))}
-
-
 def write_file(path: Path, kind: str, content: Mapping[str, Any]) -> None:
     """Write tensors and plain values under a header with their hash."""
     buffer = io.BytesIO()
     torch.save(dict(content), buffer)
-    body = buffer.getvalue()
-    header = {
-        "version": CHECKPOINT_VERSION,
-        "kind": kind,
-        "sha256": hashlib.sha256(body).hexdigest(),
-    }
-    with replacing(path) as temporary:
-        temporary.write_bytes(_START + json.dumps(header).encode() + b"\n" + body)
+    frame(path, kind, STATE_VERSION, buffer.getvalue())
 
 
 def read_file(path: Path, kind: str, device: torch.device) -> dict[str, Any]:
     """Read what `write_file` wrote; raises CheckpointError for any other bytes."""
-    wanted = f"expected a {kind} of version {CHECKPOINT_VERSION}"
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise CheckpointError(f"{path}: no such file, {wanted}") from None
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read ({error.strerror}), {wanted}") from None
-    line, _, body = content.partition(b"\n")
-    try:
-        header = json.loads(line.removeprefix(_START)) if line.startswith(_START) else None
-    except ValueError:
-        header = None
-    if not isinstance(header, dict):
-        raise CheckpointError(f"{path}: not a checkpoint, {wanted}")
-    if header.get("version") != CHECKPOINT_VERSION:
-        raise CheckpointError(f"{path}: is of version {header.get('version')}, {wanted}")
-    if header.get("kind") != kind:
-        raise CheckpointError(f"{path}: holds a {header.get('kind')}, {wanted}")
-    if hashlib.sha256(body).hexdigest() != header.get("sha256"):
-        raise CheckpointError(f"{path}: truncated or changed after it was written, {wanted}")
+    body = unframe(path, kind, STATE_VERSION)
     # Its hash is right, so this is what was written here; weights_only bars all but plain values
     # even so, since anyone can write a hash.
     try:
         return torch.load(io.BytesIO(body), map_location=device, weights_only=True)
     except (RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError) as error:
         reason = str(error).strip().splitlines()[0]
-        raise CheckpointError(f"{path}: cannot be read ({reason[:200]}), {wanted}") from None
+        raise CheckpointError(
+            f"{path}: cannot be read ({reason[:200]}), expected a {kind} of version {STATE_VERSION}"
+        ) from None
 
 
 # --- rows -----------------------------------------------------------------------------------

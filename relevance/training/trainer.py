@@ -24,11 +24,11 @@ import torch
 from relevance.errors import RelevanceWarning
 from relevance.metrics import accuracy
 from relevance.models import RelevanceModel
+from relevance.networks import CheckpointError
 from relevance.scene import PREDICATES, Predicate, group_of
 from relevance.store import Dataset, DatasetError, locate
 from relevance.training.catalogue import Catalogue
 from relevance.training.checkpoints import (
-    CheckpointError,
     checkpoint_id,
     data_hash,
     find_checkpoint,

@@ -1,0 +1,103 @@
+"""The same sums in the forms that ONNX Runtime does fastest, for while a graph is traced.
+
+A traced network is asked about one scene without padding. What is here is equal to what bodies
+do otherwise but for rounding.
+
+Shape suffixes: B scenes (one), N objects, L tokens, D width, E channels, H and W height and width
+in pixels, S samples along an edge, R pixels of a line, C channels of a picture, M maps,
+K whatever.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from relevance.models.config import PATCH, STRIDE
+
+_TILE = 16
+"""Pixels of a row that are copied together."""
+
+
+def tracing() -> bool:
+    """Whether a graph is being made, in place of numbers."""
+    return torch.onnx.is_in_onnx_export()
+
+
+def unshuffled(layers: nn.Sequential, image_BCHW: Tensor) -> Tensor:
+    """`layers`, which begin with a PixelUnshuffle and a convolution of 1x1, of image - 0.5.
+
+    The two are one convolution whose stride is its size, and it shifts the pixels, too: two
+    copies of the image less.
+    """
+    first, rest = layers[1], layers[2:]
+    assert isinstance(first, nn.Conv2d)
+    assert first.bias is not None
+    weight = first.weight.view(first.out_channels, -1, STRIDE, STRIDE)
+    shift = first.bias - weight.sum((1, 2, 3)) / 2
+    return rest(F.conv2d(image_BCHW, weight, shift, stride=STRIDE))
+
+
+def sums(x_BEK: Tensor) -> Tensor:
+    """Sums over the channels, (B, 1, K)."""
+    return x_BEK.new_ones(1, x_BEK.shape[1]) @ x_BEK if tracing() else x_BEK.sum(1, keepdim=True)
+
+
+def windows(
+    maps_MCHW: Tensor, centre_N2: Tensor, edge: float, *, own: bool
+) -> tuple[Tensor, Tensor]:
+    """Squares around centres (u and v in -1..1), resampled: (N, C, PATCH, PATCH).
+
+    Of the one map, or of each object's own. And how much of each sample is inside of the map,
+    (N, 1, PATCH, PATCH): outside is nothing. Samples lie on rows and columns, so that a square is
+    a small part of the map, copied in tiles, between two small matrices; GridSample takes twice
+    as long.
+    """
+    channels, height, width = maps_MCHW.shape[1:]
+    step_S = ((torch.arange(PATCH) + 0.5) / PATCH - 0.5) * edge - 0.5
+    middle_N2 = (centre_N2 + 1) * torch.tensor([width / 2, height / 2])
+    x_NS, y_NS = (middle_N2[:, axis, None] + step_S for axis in range(2))
+    rows = min(int(edge) + 2, height)
+    tiles = min((rows + 2 * _TILE - 2) // _TILE, width // _TILE)
+    x_N1 = (x_NS[:, :1] / _TILE).floor().clamp(0, width // _TILE - tiles)
+    y_N1 = y_NS[:, :1].floor().clamp(0, height - rows)
+    corner_N1 = (y_N1 * (width // _TILE) + x_N1).long()
+    if own:
+        map_N = torch.arange(centre_N2.shape[0])
+        corner_N1 = corner_N1 + map_N[:, None] * (height * width // _TILE)
+    part = torch.arange(channels)[:, None] * height + torch.arange(rows)
+    part = part[..., None] * (width // _TILE) + torch.arange(tiles)
+    place_NK = corner_N1 + part.flatten()
+    cut = maps_MCHW.reshape(-1, _TILE)[place_NK].view(-1, channels * rows, tiles * _TILE)
+    across_NSR = _taps(x_NS - x_N1 * _TILE, tiles * _TILE)
+    down_NSR = _taps(y_NS - y_N1, rows)
+    cut = (cut @ across_NSR.transpose(1, 2)).view(-1, channels, rows, PATCH)
+    inside = down_NSR.sum(-1)[:, None, :, None] * across_NSR.sum(-1)[:, None, None]
+    return down_NSR[:, None] @ cut, inside
+
+
+def _taps(at_NS: Tensor, count: int) -> Tensor:
+    """How much each pixel of a line counts for each sample of it, bilinear: (N, S, R)."""
+    return (1 - (at_NS[..., None] - torch.arange(count)).abs()).relu()
+
+
+class _Attention(torch.autograd.Function):
+    """Self-attention of all to all, the projection to queries, keys and values included."""
+
+    @staticmethod
+    def forward(ctx: Any, x_BLD: Tensor, weight: Tensor, bias: Tensor, heads: int) -> Tensor:
+        return torch.empty_like(x_BLD)
+
+    @staticmethod
+    def symbolic(g: Any, x: Any, weight: Any, bias: Any, heads: int) -> Any:
+        turned = g.op("Transpose", weight, perm_i=[1, 0])
+        seen = g.op("com.microsoft::Attention", x, turned, bias, num_heads_i=heads)
+        return seen.setType(x.type())
+
+
+def attend(x_BLD: Tensor, qkv: nn.Linear, heads: int) -> Tensor:
+    """What `scaled_dot_product_attention` makes of x with these projections, (B, L, D)."""
+    return _Attention.apply(x_BLD, qkv.weight, qkv.bias, heads)  # pyright: ignore
