@@ -15,6 +15,7 @@ TESTS ?= $(FIRST:%=tests/test_%.py) $(wildcard tests/test_*.py)
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # --no-compile: byte code is made when a module is first used, which saves a minute here.
+COMPILE := $(BIN)/python -c "import relevance.planner; relevance.planner.warm_up()"
 
 .PHONY: demo test test-slow check format drawing deploy clean
 .DELETE_ON_ERROR:
@@ -60,6 +61,7 @@ deploy: .venv/installed
 
 .venv/installed: pyproject.toml | .venv/bin/python
 	$(PIP) install --no-compile -e .
+	$(COMPILE)  # so that nobody's first plan waits for it; the tests begin with some that need none
 	touch $@
 
 .venv/installed-dev: pyproject.toml | .venv/bin/python
