@@ -126,7 +126,6 @@ def _traced(
             output_names=list(outputs),
             dynamic_axes={k: v for k, v in varies.items() if k in given or k in outputs},
             opset_version=_OPSET,
-            custom_opsets={"com.microsoft": 1},
             do_constant_folding=False,
         )
     graph = onnx.load_from_string(file.getvalue())
