@@ -41,7 +41,7 @@ def graphs_of(model: RelevanceModel) -> GraphNetwork | None:
     if not model.body.traced:
         return None
     config = {"body": model.body_name}
-    weights = {name: value.float().numpy() for name, value in model.state_dict().items()}
+    weights = {name: value.float().numpy(force=True) for name, value in model.state_dict().items()}
     meta = {"config": {"model": config}, "predicates": list(model.predicates)}
     made = Checkpoint(meta=meta, weights=weights, graphs=export_graphs(model))
     return GraphNetwork(made, Path("(made up)"))
