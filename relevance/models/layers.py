@@ -20,28 +20,48 @@ from relevance.scene import Camera
 
 
 class Attention(nn.Module):
-    """Pre-norm transformer layer on `scaled_dot_product_attention`, with our own masks."""
+    """Pre-norm transformer layer on `scaled_dot_product_attention`, with our own masks.
 
-    def __init__(self, width: int, heads: int, expansion: int = 4) -> None:
+    Told what lies between every two tokens, rows of width `between`, that has a say in who looks
+    at whom, and rows carry along what lies between them and what they look at.
+    """
+
+    def __init__(self, width: int, heads: int, expansion: int = 4, between: int = 0) -> None:
         super().__init__()
         self.heads = heads
         self.norm_in, self.norm_mid = nn.LayerNorm(width), nn.LayerNorm(width)
         self.qkv, self.out = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        if between:
+            self.say = nn.Linear(between, heads)
+            self.carried = nn.Linear(heads * between, width, bias=False)
         self.mlp = nn.Sequential(
             nn.Linear(width, expansion * width), nn.GELU(), nn.Linear(expansion * width, width)
         )
 
-    def forward(self, x: Tensor, allowed: Tensor | None = None) -> Tensor:
-        """x (B, L, D); allowed (B or 1, L, L) bool: row may look at column (None: at all)."""
-        if tracing() and allowed is None:
+    def forward(
+        self, x: Tensor, allowed: Tensor | None = None, between: Tensor | None = None
+    ) -> Tensor:
+        """x (B, L, D); allowed (B or 1, L, L) bool: row may look at column (None: at all); between
+        (B, L, L, E)."""
+        if tracing() and allowed is None and between is None:
             x = x + self.out(attend(self.norm_in(x), self.qkv, self.heads))
             return x + self.mlp(self.norm_mid(x))
         batch, length, width = x.shape
         qkv = self.qkv(self.norm_in(x)).view(batch, length, 3, self.heads, width // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)
         mask = None if allowed is None else allowed[:, None]
-        seen = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-        x = x + self.out(seen.transpose(1, 2).reshape(batch, length, width))
+        if between is None:
+            seen = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+            x = x + self.out(seen.transpose(1, 2).reshape(batch, length, width))
+            return x + self.mlp(self.norm_mid(x))
+        logits = q @ k.transpose(2, 3) / math.sqrt(width // self.heads)
+        logits = logits + self.say(between).permute(0, 3, 1, 2)
+        if mask is not None:
+            logits = logits.masked_fill(~mask, -math.inf)
+        share_BHLL = logits.softmax(-1)
+        seen = (share_BHLL @ v).transpose(1, 2).reshape(batch, length, width)
+        carried = share_BHLL.transpose(1, 2) @ between  # (B, L, H, E)
+        x = x + self.out(seen) + self.carried(carried.flatten(2))
         return x + self.mlp(self.norm_mid(x))
 
     def looks(self, x: Tensor, rows: slice, columns: slice) -> Tensor:

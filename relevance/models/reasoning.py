@@ -19,6 +19,41 @@ from relevance.scene import Predicate, Robot
 ROBOT = Robot()
 """Whose axes the directions of goals are: every picture was taken in front of this one."""
 GOAL_FEATURES = 3 * GEOMETRY + 2 + 2 * 8
+BETWEEN_FEATURES = 3 + ANGLES + 1 + 2
+BETWEEN = 32
+"""Width of what lies between two objects."""
+
+
+class Between(nn.Module):
+    """What lies between every two objects: whether one is in the way of the hand at another."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Sequential(
+            nn.Linear(BETWEEN_FEATURES, BETWEEN), nn.GELU(), nn.Linear(BETWEEN, BETWEEN), nn.GELU()
+        )
+
+    def forward(self, geometry: Tensor) -> Tensor:
+        """(B, N, N, BETWEEN), row from column, from geometry (B, N, GEOMETRY)."""
+        return self.net(between_features(geometry))
+
+
+def between_features(geometry: Tensor) -> Tensor:
+    """How each object (row) stands to each other (column), (B, N, N, BETWEEN_FEATURES).
+
+    Offset of the centres, gap of the footprints along ANGLES directions (negative where their
+    shadows overlap) and the widest of these, heights of the column's top and bottom over the
+    row's bottom.
+    """
+    row, column = geometry[:, :, None], geometry[:, None]
+    offset = column[..., :3] - row[..., :3]
+    angle = torch.arange(ANGLES, device=geometry.device) * (math.pi / ANGLES)
+    axes = torch.stack([angle.cos(), angle.sin()]).to(geometry.dtype)
+    gaps = (offset[..., :2] @ axes).abs() - row[..., 6:] - column[..., 6:]
+    half = geometry[..., 5] / 2
+    bottom, top = geometry[..., 2] - half, geometry[..., 2] + half
+    heights = [edge[:, None] - bottom[:, :, None] for edge in (top, bottom)]
+    return torch.cat([offset, gaps, gaps.amax(-1, keepdim=True), torch.stack(heights, -1)], dim=-1)
 
 
 class Reasoning(nn.Module):
@@ -32,7 +67,10 @@ class Reasoning(nn.Module):
         self.predicate = nn.ParameterDict(
             {name: nn.Parameter(torch.zeros(width)) for name in predicates}
         )
-        self.layers = nn.ModuleList(Attention(width, heads, expansion=2) for _ in range(layers))
+        self.between = Between()
+        self.layers = nn.ModuleList(
+            Attention(width, heads, expansion=2, between=BETWEEN) for _ in range(layers)
+        )
 
     def forward(
         self, tokens: Tensor, present: Tensor, geometry: Tensor, predicate: Predicate, goals: Tensor
@@ -41,11 +79,13 @@ class Reasoning(nn.Module):
         features = goal_features(geometry, predicate, goals)
         x_BGND = tokens[:, None] + self.place(features) + self.predicate[predicate.name]
         x = x_BGND[0] if tracing() else x_BGND.flatten(0, 1)
-        allowed = columns(present)
+        allowed, between = columns(present), self.between(geometry)
+        if not tracing():
+            between = between.repeat_interleave(goals.shape[1], dim=0)
         if allowed is not None:
             allowed = allowed.repeat_interleave(goals.shape[1], dim=0)
         for layer in self.layers:
-            x = layer(x, allowed)
+            x = layer(x, allowed, between)
         return x[None] if tracing() else x.view(x_BGND.shape)
 
 
