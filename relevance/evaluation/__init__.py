@@ -15,6 +15,7 @@ from relevance.evaluation.accuracies import (
     in_group,
     read_predictions,
 )
+from relevance.evaluation.calibration import LEVELS, Calibration, CalibrationError, Promise
 from relevance.evaluation.comparisons import (
     Comparison,
     guided_cost,
@@ -24,6 +25,14 @@ from relevance.evaluation.comparisons import (
     shown_as,
     speed_table,
     summarise,
+)
+from relevance.evaluation.coverage import (
+    Covered,
+    calibrate,
+    covered,
+    covered_speeds,
+    out_of_reach,
+    read_calibration,
 )
 from relevance.evaluation.predictions import policy_of_checkpoint, predict, unjudged
 from relevance.evaluation.reruns import (
@@ -44,27 +53,37 @@ from relevance.evaluation.scorer import (
 __all__ = [
     "BREAKDOWNS",
     "JUDGES",
+    "LEVELS",
     "NETWORK",
     "RULE",
+    "Calibration",
+    "CalibrationError",
     "Comparison",
+    "Covered",
     "EvaluationConfig",
     "EvaluationError",
     "NetworkScorer",
     "Predictions",
+    "Promise",
     "Task",
     "accuracy_table",
     "breakdown_table",
+    "calibrate",
     "checkpoint_id",
     "choose_tasks",
     "compare",
+    "covered",
+    "covered_speeds",
     "evaluate",
     "guided_cost",
     "in_group",
     "left_out",
     "load_guide",
     "load_scorer",
+    "out_of_reach",
     "policy_of_checkpoint",
     "predict",
+    "read_calibration",
     "read_evaluations",
     "read_predictions",
     "settings",
