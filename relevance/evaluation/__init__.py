@@ -34,6 +34,7 @@ from relevance.evaluation.coverage import (
     out_of_reach,
     read_calibration,
 )
+from relevance.evaluation.pictures import PictureError, Seen, look_at
 from relevance.evaluation.predictions import policy_of_checkpoint, predict, unjudged
 from relevance.evaluation.reruns import (
     EvaluationConfig,
@@ -49,6 +50,7 @@ from relevance.evaluation.scorer import (
     load_guide,
     load_scorer,
 )
+from relevance.evaluation.scores import scores
 
 __all__ = [
     "BREAKDOWNS",
@@ -63,8 +65,10 @@ __all__ = [
     "EvaluationConfig",
     "EvaluationError",
     "NetworkScorer",
+    "PictureError",
     "Predictions",
     "Promise",
+    "Seen",
     "Task",
     "accuracy_table",
     "breakdown_table",
@@ -80,12 +84,14 @@ __all__ = [
     "left_out",
     "load_guide",
     "load_scorer",
+    "look_at",
     "out_of_reach",
     "policy_of_checkpoint",
     "predict",
     "read_calibration",
     "read_evaluations",
     "read_predictions",
+    "scores",
     "settings",
     "shown_as",
     "speed_table",
