@@ -51,6 +51,7 @@ from relevance.evaluation.scorer import (
     load_scorer,
 )
 from relevance.evaluation.scores import scores
+from relevance.evaluation.suites import SUITES, Suite, away, suite_of
 
 __all__ = [
     "BREAKDOWNS",
@@ -58,6 +59,7 @@ __all__ = [
     "LEVELS",
     "NETWORK",
     "RULE",
+    "SUITES",
     "Calibration",
     "CalibrationError",
     "Comparison",
@@ -69,8 +71,10 @@ __all__ = [
     "Predictions",
     "Promise",
     "Seen",
+    "Suite",
     "Task",
     "accuracy_table",
+    "away",
     "breakdown_table",
     "calibrate",
     "checkpoint_id",
@@ -95,6 +99,7 @@ __all__ = [
     "settings",
     "shown_as",
     "speed_table",
+    "suite_of",
     "summarise",
     "unjudged",
 ]
