@@ -92,7 +92,7 @@ def test_boxes_hide_each_other() -> None:
 
 
 def test_younger_settings_change_no_scene_that_was_drawn_before() -> None:
-    """Their defaults draw nothing of their own: a twin's odds of almost 0 change all that follow."""
+    """Their defaults draw nothing of their own, not even whether a box is a twin."""
     [plain] = drawn(SceneConfig(), 1)
     assert drawn(SceneConfig(saturation=(0.55, 1.0), occlusion=0.0), 1) == [plain]
     assert drawn(SceneConfig(twins=1e-9), 1) != [plain]
