@@ -207,6 +207,16 @@ def ratio_interval(
     )
 
 
+def binomial_interval(hits: int, n: int, *, confidence: float = 0.95) -> Interval:
+    """A share with its exact (Clopper-Pearson) interval; nan of nothing."""
+    from scipy.stats import binomtest  # half a second to import
+
+    if not n:
+        return Interval(value=np.nan, low=np.nan, high=np.nan, n=0)
+    found = binomtest(hits, n).proportion_ci(confidence, method="exact")
+    return Interval(value=hits / n, low=float(found.low), high=float(found.high), n=n)
+
+
 def bootstrap(
     samples: tuple[np.ndarray, ...],
     statistic: Callable[..., Any],

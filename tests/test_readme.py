@@ -34,9 +34,12 @@ NOT_RUN = {
     r"^relevance bench\b": "measures for minutes: tests/test_benchmarks.py",
     r"^relevance diff\b": "needs a dataset that was planned anew: tests/test_families.py",
     r"laptop|paper": "makes much",
+    r" FILE\b|--coverage": "takes a calibration on many scenes: tests/test_coverage.py",
 }
 """Lines of shell that are left out, and why."""
-SLOW = r"^relevance (append|merge|repair|label|generate|export|train|evaluate|check)\b"
+SLOW = (
+    r"^relevance (append|merge|repair|label|generate|export|train|evaluate|check|suite|coverage)\b"
+)
 """Lines that take their time; only the slow test runs them."""
 DRAWING = r"[│├└→]|->|^[A-Z]+/\s*$|\.parquet|\.tar"
 """A block without a language that shows something and asks for nothing."""

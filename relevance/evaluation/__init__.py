@@ -15,6 +15,7 @@ from relevance.evaluation.accuracies import (
     in_group,
     read_predictions,
 )
+from relevance.evaluation.calibration import LEVELS, Calibration, CalibrationError, Promise
 from relevance.evaluation.comparisons import (
     Comparison,
     guided_cost,
@@ -25,6 +26,15 @@ from relevance.evaluation.comparisons import (
     speed_table,
     summarise,
 )
+from relevance.evaluation.coverage import (
+    Covered,
+    calibrate,
+    covered,
+    covered_speeds,
+    out_of_reach,
+    read_calibration,
+)
+from relevance.evaluation.pictures import PictureError, Seen, look_at
 from relevance.evaluation.predictions import policy_of_checkpoint, predict, unjudged
 from relevance.evaluation.reruns import (
     EvaluationConfig,
@@ -40,36 +50,56 @@ from relevance.evaluation.scorer import (
     load_guide,
     load_scorer,
 )
+from relevance.evaluation.scores import scores
+from relevance.evaluation.suites import SUITES, Suite, away, suite_of
 
 __all__ = [
     "BREAKDOWNS",
     "JUDGES",
+    "LEVELS",
     "NETWORK",
     "RULE",
+    "SUITES",
+    "Calibration",
+    "CalibrationError",
     "Comparison",
+    "Covered",
     "EvaluationConfig",
     "EvaluationError",
     "NetworkScorer",
+    "PictureError",
     "Predictions",
+    "Promise",
+    "Seen",
+    "Suite",
     "Task",
     "accuracy_table",
+    "away",
     "breakdown_table",
+    "calibrate",
     "checkpoint_id",
     "choose_tasks",
     "compare",
+    "covered",
+    "covered_speeds",
     "evaluate",
     "guided_cost",
     "in_group",
     "left_out",
     "load_guide",
     "load_scorer",
+    "look_at",
+    "out_of_reach",
     "policy_of_checkpoint",
     "predict",
+    "read_calibration",
     "read_evaluations",
     "read_predictions",
+    "scores",
     "settings",
     "shown_as",
     "speed_table",
+    "suite_of",
     "summarise",
     "unjudged",
 ]

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from relevance.errors import RelevanceError, RelevanceWarning
+from relevance.evaluation.calibration import Promise
 from relevance.networks import GraphNetwork, Network, named, read_checkpoint, true_geometry
-from relevance.planner import Guide
+from relevance.planner import GUIDES, Guide
 from relevance.sampling import same_view, view_of
 from relevance.scene import Goal, Predicate, Scene, lookalikes
 from relevance.store import Dataset
@@ -61,6 +62,9 @@ class NetworkScorer:
         self.yaws = tuple(yaws)
         """How the robots that it learned from were turned, rad."""
         self.capacity = capacity
+        self.promise: Promise | None = None
+        """A coverage, where it is asked for: its betas are then part of every score, so that
+        beta = 0 keeps what was promised."""
         self.seconds = 0.0
         """CPU seconds of the last `scores`, a needed encoding included, rendering left out."""
         self._seen: OrderedDict[Hashable, tuple[np.ndarray, np.ndarray]] = OrderedDict()
@@ -91,7 +95,8 @@ class NetworkScorer:
 
     def offset(self, predicate: Predicate | str) -> float:
         """What a score has beyond the network's own logit."""
-        return self.offsets.get(str(predicate), 0.0)
+        promised = self.promise.beta(str(predicate)) if self.promise else 0.0
+        return self.offsets.get(str(predicate), 0.0) + promised
 
     def scores(self, scene: Scene, goal: Goal) -> dict[str, float]:
         """Score of every object of the scene."""
@@ -202,14 +207,19 @@ def open_checkpoint(checkpoint: str | Path) -> tuple[NetworkScorer, dict[str, An
     return scorer, meta
 
 
-def load_scorer(checkpoint: str | Path, *, into: Dataset | None = None) -> NetworkScorer:
+def load_scorer(
+    checkpoint: str | Path, *, into: Dataset | None = None, coverage: float | None = None
+) -> NetworkScorer:
     """Read a checkpoint; CheckpointError names the file and the found and expected version.
 
-    `into` is a dataset that gets the checkpoint's row, where it has none yet.
+    `into` is a dataset that gets the checkpoint's row, where it has none yet; `coverage` is what
+    is promised of what scores over 0, see `Promise`.
     """
     scorer, meta = open_checkpoint(checkpoint)
     if into is not None:
         enter(into, checkpoint, meta)
+    if coverage is not None:
+        scorer.promise = Promise.of(meta, coverage)
     return scorer
 
 
@@ -231,9 +241,25 @@ def checkpoint_id(checkpoint: str | Path) -> str:
 
 
 def load_guide(
-    checkpoint: str | Path, *, mode: str = "prune-then-full", beta: float = 0.0
+    checkpoint: str | Path,
+    *,
+    mode: str = "prune-then-full",
+    beta: float = 0.0,
+    coverage: float | None = None,
 ) -> Guide:
-    """A guide for `plan` from a checkpoint file; EvaluationError unless beta is finite."""
+    """A guide for `plan` from a checkpoint file; EvaluationError unless beta is finite.
+
+    coverage: instead of a beta, with what probability at least all relevant objects are kept (see
+    `calibration`); for a calibrated checkpoint, and a mode that goes by what is kept.
+    """
     if not math.isfinite(beta):
         raise EvaluationError(f"beta: {beta}, expected a finite number")
-    return Guide(scorer=load_scorer(checkpoint), mode=mode, beta=beta)
+    if coverage is not None:
+        keeping = [n for n, kind in GUIDES.items() if kind.guided and kind.walk == "levels"]
+        if mode in GUIDES and mode not in keeping:
+            raise EvaluationError(
+                f"coverage: guide {mode} leaves nothing out, expected one of {', '.join(keeping)}"
+            )
+        if beta:
+            raise EvaluationError(f"coverage {coverage:g} and beta {beta:g}: expected one of them")
+    return Guide(scorer=load_scorer(checkpoint, coverage=coverage), mode=mode, beta=beta)

@@ -1,7 +1,7 @@
 """Logic-Geometric Programming over pick and place: `plan(scene, goal)`."""
 
 from relevance.planner.checking import penetration
-from relevance.planner.guides import GUIDES, Guide, GuideError, Mode, Scorer
+from relevance.planner.guides import GUIDES, Guide, GuideError, Mode, Scorer, ask
 from relevance.planner.rai.planner import Rai, RaiConfig
 from relevance.planner.result import (
     PLANNER_VERSION,
@@ -34,6 +34,7 @@ __all__ = [
     "Scorer",
     "Seconds",
     "Status",
+    "ask",
     "penetration",
     "plan",
     "trajectory",

@@ -20,7 +20,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from relevance.evaluation import Comparison, Predictions, guided_cost
+from relevance.evaluation import LEVELS, Comparison, Covered, Predictions, guided_cost
 from relevance.metrics import mean_interval
 from relevance.report.paper import paper
 from relevance.report.style import (
@@ -207,6 +207,33 @@ def beta_accuracy(*axes: Axes, predictions: Predictions) -> None:
         ax.set_ylim(0, 1.02)
         _percent_axis(ax.yaxis)
     max(axes, key=lambda ax: len(ax.lines)).legend(loc="lower left")
+
+
+def coverage(*axes: Axes, rows: Sequence[Covered]) -> None:
+    """What was promised against what was reached, and against how much is kept for it."""
+    reached_ax, kept_ax = axes
+    for number, group in enumerate(dict.fromkeys(row.group for row in rows)):
+        found, color = [row for row in rows if row.group == group], family_color(group)
+        promised = [row.coverage for row in found]
+        label = f"{group} (n = {found[0].reached.n} scenes)"
+        reached_ax.plot(promised, [row.reached_all for row in found], color=color, label=label)
+        for row in found:
+            if row.coverage in LEVELS:
+                low, value, high = row.reached.low, row.reached.value, row.reached.high
+                at, spread = row.coverage + 0.003 * number, [[value - low], [high - value]]
+                style = {"fmt": "o", "markersize": 4, "linewidth": 1, "capsize": 2.5}
+                reached_ax.errorbar(at, value, spread, color=color, **style)
+        kept_ax.plot(promised, [row.kept / row.objects for row in found], color=color)
+    ends = [min(row.coverage for row in rows), 1.0]
+    reached_ax.plot(ends, ends, ":", color=MUTED, linewidth=1.2, label="as promised")
+    reached_ax.set_title("goals with everything relevant kept")
+    reached_ax.legend(loc="lower right")
+    kept_ax.set_title("boxes that are kept, the goal's own included")
+    kept_ax.set_ylim(0, 1.02)
+    for ax in axes:
+        ax.set_xlabel("promised coverage")
+        _percent_axis(ax.xaxis)
+        _percent_axis(ax.yaxis)
 
 
 def scores(*axes: Axes, predictions: Predictions) -> None:

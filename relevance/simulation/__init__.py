@@ -1,4 +1,4 @@
-"""Everything that pybullet does here: pictures of scenes, and the replay of plans.
+"""Everything that pybullet does here: pictures of scenes, the replay of plans, others' worlds.
 
 The only part of the project that imports pybullet.
 """
@@ -13,6 +13,7 @@ from relevance.simulation.rendering import (
     rejects,
 )
 from relevance.simulation.replaying import MAX_PENETRATION, Replay, replay
+from relevance.simulation.worlds import Note, World, WorldError, read_bullet, write_bullet
 
 __all__ = [
     "MAX_PENETRATION",
@@ -20,9 +21,14 @@ __all__ = [
     "MIN_VISIBLE_PIXELS",
     "RENDERER_VERSION",
     "VIEW_PIXELS",
+    "Note",
     "Renderer",
     "Rendering",
     "Replay",
+    "World",
+    "WorldError",
+    "read_bullet",
     "rejects",
     "replay",
+    "write_bullet",
 ]
