@@ -14,11 +14,22 @@ from relevance.cli import (
     predicting,
     running,
     sharing,
+    viewing,
 )
 from relevance.cli.arguments import Command
 
 COMMANDS: dict[str, Command] = {
     name: command
-    for group in (making, learning, planning, predicting, asking, sharing, running, benchmarks)
+    for group in (
+        making,
+        learning,
+        planning,
+        viewing,
+        predicting,
+        asking,
+        sharing,
+        running,
+        benchmarks,
+    )
     for name, command in group.COMMANDS.items()
 }
