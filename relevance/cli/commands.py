@@ -8,6 +8,7 @@ imports the rest when it runs.
 from relevance.cli import (
     asking,
     benchmarks,
+    champions,
     learning,
     making,
     planning,
@@ -23,6 +24,7 @@ COMMANDS: dict[str, Command] = {
     for group in (
         making,
         learning,
+        champions,
         planning,
         viewing,
         predicting,

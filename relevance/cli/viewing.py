@@ -112,7 +112,7 @@ def _films(gif: Path | None, mp4: Path | None) -> list[Path]:
 def _guide(dataset: Any, checkpoint: str | None, mode: str, beta: float) -> Any:
     """The guide of a checkpoint, the one that is meant where none is named."""
     from relevance.evaluation import load_guide
-    from relevance.training import find_checkpoint
+    from relevance.networks import find_checkpoint
 
     path = checkpoint or "glimpse"
     if dataset is not None and (checkpoint is not None or dataset.files("checkpoints")):

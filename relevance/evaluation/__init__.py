@@ -15,6 +15,7 @@ from relevance.evaluation.accuracies import (
     in_group,
     read_predictions,
 )
+from relevance.evaluation.champion import Trial, TrialConfig, contend, fresh_tasks
 from relevance.evaluation.comparisons import (
     Comparison,
     guided_cost,
@@ -52,12 +53,16 @@ __all__ = [
     "NetworkScorer",
     "Predictions",
     "Task",
+    "Trial",
+    "TrialConfig",
     "accuracy_table",
     "breakdown_table",
     "checkpoint_id",
     "choose_tasks",
     "compare",
+    "contend",
     "evaluate",
+    "fresh_tasks",
     "guided_cost",
     "in_group",
     "left_out",

@@ -19,7 +19,15 @@ from typing import Any
 import numpy as np
 
 from relevance.errors import RelevanceError, RelevanceWarning
-from relevance.networks import GraphNetwork, Network, named, read_checkpoint, true_geometry
+from relevance.networks import (
+    CHAMPION,
+    GraphNetwork,
+    Network,
+    find_checkpoint,
+    named,
+    read_checkpoint,
+    true_geometry,
+)
 from relevance.planner import Guide
 from relevance.sampling import same_view, view_of
 from relevance.scene import Goal, Predicate, Scene, lookalikes
@@ -231,9 +239,21 @@ def checkpoint_id(checkpoint: str | Path) -> str:
 
 
 def load_guide(
-    checkpoint: str | Path, *, mode: str = "prune-then-full", beta: float = 0.0
+    checkpoint: str | Path,
+    *,
+    mode: str = "prune-then-full",
+    beta: float = 0.0,
+    dataset: str | Path | None = None,
 ) -> Guide:
-    """A guide for `plan` from a checkpoint file; EvaluationError unless beta is finite."""
+    """A guide for `plan` from a checkpoint file, a model's name, or a checkpoint of a dataset.
+
+    Of a `dataset` it may be an id or "champion". Raises EvaluationError unless beta is finite, and
+    where it is not said whose champion is meant.
+    """
     if not math.isfinite(beta):
         raise EvaluationError(f"beta: {beta}, expected a finite number")
+    if dataset is not None:
+        checkpoint = find_checkpoint(dataset, checkpoint)
+    elif str(checkpoint) == CHAMPION and not named(checkpoint).exists():
+        raise EvaluationError('load_guide("champion"): expected dataset=, whose champion it is')
     return Guide(scorer=load_scorer(checkpoint), mode=mode, beta=beta)
