@@ -14,7 +14,7 @@ counts then.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -46,7 +46,7 @@ class TrialConfig:
     """How contenders are tried."""
 
     tasks: Annotated[int, Field(ge=2)] = 40
-    """Fresh tasks, predicates in turn: about a minute of CPU for each checkpoint."""
+    """Fresh tasks, predicates in turn."""
     boxes: Annotated[int, Field(ge=3, le=30)] = 20
     """Boxes of each."""
     guide: str = "order"
@@ -94,39 +94,45 @@ class Trial:
     work: Interval
     """Work of the contender over the other's, over the tasks that either solves."""
     boxes: int
+    lacking: tuple[str, ...] = ()
+    """Predicates that the champion answers and the contender cannot; then nothing was rerun."""
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Why it is refused; none where it is promoted."""
+        if self.lacking:
+            return (f"it has no head for {', '.join(self.lacking)}",)
+        found = []
+        if self.change is not None and not self.change.high >= 0:  # nan is no proof either
+            found.append("true relevant falls")
+        if not self.work.high < 1:
+            found.append("no less work beyond noise")
+        return tuple(found)
 
     @property
     def promoted(self) -> bool:
         """Whether it is better, beyond noise."""
-        return not (self._fell or self._costs)
-
-    @property
-    def _fell(self) -> bool:
-        return self.change is not None and not self.change.high >= 0  # nan is no proof either
-
-    @property
-    def _costs(self) -> bool:
-        return not self.work.high < 1
+        return not self.faults
 
     @property
     def why(self) -> str:
         """The figures, and what they decide, in a sentence."""
-        other = self.champion or "no guide"
-        said = [
-            f"work {self.work:.2f} times that of {other} on {self.work.n} tasks of "
-            f"{self.boxes} boxes"
-        ]
+        said = ", ".join(self.faults) or "better, beyond noise"
+        if self.lacking:
+            return said
+        figures = (
+            f"work {self.work:.2f} times that of {self.champion or 'no guide'} "
+            f"on {self.work.n} solved tasks of {self.boxes} boxes"
+        )
         if self.change is not None:
-            points = Interval(
-                value=100 * self.change.value,
-                low=100 * self.change.low,
-                high=100 * self.change.high,
-                n=self.change.n,
+            low, value, high = (
+                f"{100 * share:+.1f}"
+                for share in (self.change.low, self.change.value, self.change.high)
             )
-            said.append(f"true relevant {points:+.1f} points over {points.n} test scenes")
-        faults = ["true relevant falls"] * self._fell
-        faults += ["no less work beyond noise"] * self._costs
-        return f"{'; '.join(said)}: {' and '.join(faults) or 'better, beyond noise'}"
+            figures += (
+                f"; true relevant {value} points ({low} to {high}) on {self.change.n} test scenes"
+            )
+        return f"{said}: {figures}"
 
 
 def contend(
@@ -139,43 +145,54 @@ def contend(
     """Try a checkpoint against the champion and promote or refuse it, which the record keeps.
 
     Where another was promoted meanwhile, it is tried against that one. None where it is the
-    champion. Raises EvaluationError where it cannot stand in for the champion.
+    champion itself.
     """
     config = config or TrialConfig()
     dataset = Dataset.open(root)
     path = find_checkpoint(root, checkpoint)
     contender = load_scorer(path, into=dataset)
-    tasks = fresh_tasks(dataset, config, contender.model.predicates)
-    planner = load_config(_first(dataset)).planner
-    spent: dict[str | None, list[tuple[int, bool]]] = {}
-    while (standing := read_record(dataset).champion) != contender.checkpoint_id:
-        other = None
-        if standing is not None:
-            other = load_scorer(find_checkpoint(root, standing))
-            _same_heads(contender, other)
-        pair = {contender.checkpoint_id: contender, standing: other}
-        todo = {name: scorer for name, scorer in pair.items() if name not in spent}
-        total, done = len(tasks) * len(todo), 0
-        for name, scorer in todo.items():
-            guide = Guide(scorer=scorer, mode=config.guide) if scorer else None
-            spent[name] = []
-            for scene, goal in tasks:
-                spent[name].append(_spent(scene, goal, planner, guide))
-                done += 1
-                if progress:
-                    progress(done, total)
-        trial = Trial(
-            contender=contender.checkpoint_id,
-            champion=standing,
-            change=_change(dataset, path, contender.checkpoint_id, standing, config.confidence),
-            work=_ratio(spent[contender.checkpoint_id], spent[standing], config.confidence),
-            boxes=config.boxes,
-        )
-        if settle(
-            dataset, trial.contender, before=standing, promoted=trial.promoted, why=trial.why
-        ):
+    name = contender.checkpoint_id
+    while (standing := read_record(dataset).champion) != name:
+        other = None if standing is None else load_scorer(find_checkpoint(root, standing))
+        trial = _trial(dataset, path, contender, other, config, progress)
+        if settle(dataset, name, before=standing, promoted=trial.promoted, why=trial.why):
             return trial
     return None
+
+
+def _trial(
+    dataset: Dataset,
+    path: Path,
+    contender: NetworkScorer,
+    champion: NetworkScorer | None,
+    config: TrialConfig,
+    progress: Progress | None,
+) -> Trial:
+    name, standing = contender.checkpoint_id, champion.checkpoint_id if champion else None
+    asked = champion.model.predicates if champion else contender.model.predicates
+    lacking = tuple(p for p in asked if p not in contender.model.predicates)
+    if lacking:
+        nothing = Interval(value=np.nan, low=np.nan, high=np.nan, n=0)
+        return Trial(
+            contender=name, champion=standing, change=None, work=nothing, boxes=config.boxes,
+            lacking=lacking,
+        )  # fmt: skip
+    planner = load_config(_first(dataset)).planner
+    guides = [
+        scorer and Guide(scorer=scorer, mode=config.guide) for scorer in (contender, champion)
+    ]
+    pairs = []
+    for done, (scene, goal) in enumerate(fresh_tasks(dataset, config, asked), 1):
+        pairs.append([_spent(scene, goal, planner, guide) for guide in guides])
+        if progress:
+            progress(done, config.tasks)
+    return Trial(
+        contender=name,
+        champion=standing,
+        change=_change(dataset, path, name, standing, config.confidence),
+        work=_ratio(pairs, config.confidence),
+        boxes=config.boxes,
+    )
 
 
 def fresh_tasks(
@@ -207,16 +224,6 @@ def _first(dataset: Dataset) -> Dataset:
     return Dataset.open(dataset.sources[0].dataset.path) if dataset.sources else dataset
 
 
-def _same_heads(contender: NetworkScorer, champion: NetworkScorer) -> None:
-    """Raise EvaluationError where the champion answers goals that the contender cannot."""
-    lacking = [n for n in champion.model.predicates if n not in contender.model.predicates]
-    if lacking:
-        raise EvaluationError(
-            f"checkpoint {contender.checkpoint_id}: has no head for {', '.join(lacking)}, which "
-            f"the champion {champion.checkpoint_id} answers"
-        )
-
-
 def _spent(
     scene: Scene, goal: Goal, planner: PlannerConfig, guide: Guide | None
 ) -> tuple[int, bool]:
@@ -225,12 +232,10 @@ def _spent(
     return result.counts.work, result.status == "solved" and result.check_ok
 
 
-def _ratio(
-    mine: Sequence[tuple[int, bool]], its: Sequence[tuple[int, bool]], confidence: float
-) -> Interval:
+def _ratio(pairs: Sequence[Sequence[tuple[int, bool]]], confidence: float) -> Interval:
     """Work over work of the tasks that either solved."""
-    pairs = [(a, b) for (a, solved), (b, also) in zip(mine, its, strict=True) if solved or also]
-    return ratio_interval([a for a, _ in pairs], [b for _, b in pairs], confidence=confidence)
+    solved = [(mine[0], its[0]) for mine, its in pairs if mine[1] or its[1]]
+    return ratio_interval([a for a, _ in solved], [b for _, b in solved], confidence=confidence)
 
 
 def _change(
@@ -256,5 +261,8 @@ def _change(
             [contender, champion, policy],
         ).fetchnumpy()
     gained, relevant = (np.asarray(columns[name], float) for name in ("gained", "relevant"))
-    share: Callable[..., np.ndarray] = lambda g, r, axis: g.sum(axis=axis) / r.sum(axis=axis)  # noqa: E731
-    return bootstrap((gained, relevant), share, confidence=confidence)
+    return bootstrap(
+        (gained, relevant),
+        lambda g, r, axis: g.sum(axis=axis) / r.sum(axis=axis),
+        confidence=confidence,
+    )
