@@ -32,19 +32,27 @@ NOISE = Interval(value=-0.01, low=-0.03, high=0.01, n=9)
 FALLS = Interval(value=-0.02, low=-0.03, high=-0.01, n=9)
 
 
-@pytest.fixture
-def dataset(tmp_path):
-    """A dataset that knows both models of the package."""
-    shutil.copytree(GOLDEN, tmp_path / "d")
-    found = Dataset.open(tmp_path / "d")
-    for name in ("geometry", "glimpse"):
-        load_scorer(name, into=found)
-    return found
-
-
-@pytest.fixture
+@pytest.fixture(scope="module")
 def ids():
+    """The models of the package."""
     return {name: load_scorer(name).checkpoint_id for name in ("geometry", "glimpse")}
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory, ids):
+    """A dataset that knows them."""
+    root = tmp_path_factory.mktemp("known") / "d"
+    shutil.copytree(GOLDEN, root)
+    for name in ids:
+        load_scorer(name, into=Dataset.open(root))
+    return root
+
+
+@pytest.fixture
+def dataset(known, tmp_path):
+    """That, to be changed."""
+    shutil.copytree(known, tmp_path / "d")
+    return Dataset.open(tmp_path / "d")
 
 
 @pytest.fixture
@@ -273,9 +281,6 @@ def test_an_object_store_is_refused_before_anything_is_written():
     class There:
         path = "s3://bucket/d"
 
-    monkey = There()
-    with (
-        pytest.raises(DatasetError, match="an object store has no locks"),
-        champions._alone(monkey),
-    ):
+    refused = pytest.raises(DatasetError, match="an object store has no locks")
+    with refused, champions._alone(There()):
         pass

@@ -45,8 +45,8 @@ _STREAM = "champion"  # a split of its own: never a scene of a dataset
 class TrialConfig:
     """How contenders are tried."""
 
-    tasks: Annotated[int, Field(ge=2)] = 40
-    """Fresh tasks, predicates in turn."""
+    tasks: Annotated[int, Field(ge=2)] = 400
+    """Fresh tasks, predicates in turn: a minute of CPU for each of the two, of 20 boxes."""
     boxes: Annotated[int, Field(ge=3, le=30)] = 20
     """Boxes of each."""
     guide: str = "order"
@@ -69,18 +69,18 @@ class TrialConfig:
 
     @classmethod
     def demo(cls) -> TrialConfig:
-        """A few minutes."""
+        """Two minutes."""
         return cls()
 
     @classmethod
     def laptop(cls) -> TrialConfig:
-        """A quarter of an hour."""
-        return cls(tasks=200)
+        """Five minutes."""
+        return cls(tasks=1000)
 
     @classmethod
     def paper(cls) -> TrialConfig:
-        """An hour."""
-        return cls(tasks=800)
+        """Ten minutes."""
+        return cls(tasks=2000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -225,7 +225,7 @@ def enter(dataset: Dataset, checkpoint: str | Path, meta: dict[str, Any]) -> Non
     """Give a dataset the row of a checkpoint, where it has none yet."""
     from relevance.training import write_row
 
-    write_row(dataset, Path(checkpoint), meta)
+    write_row(dataset, named(checkpoint), meta)
 
 
 def policy_of(config: dict[str, Any] | None) -> str:
