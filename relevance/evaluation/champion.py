@@ -140,9 +140,11 @@ def contend(
     checkpoint: str | Path,
     config: TrialConfig | None = None,
     *,
+    learned: tuple[int, str] = (0, ""),
     progress: Progress | None = None,
 ) -> Trial | None:
-    """Try a checkpoint against the champion and promote or refuse it, which the record keeps.
+    """Try a checkpoint against the champion and promote or refuse it, which the record keeps with
+    what it `learned` from (see `Event`).
 
     Where another was promoted meanwhile, it is tried against that one. None where it is the
     champion itself.
@@ -155,7 +157,8 @@ def contend(
     while (standing := read_record(dataset).champion) != name:
         other = None if standing is None else load_scorer(find_checkpoint(root, standing))
         trial = _trial(dataset, path, contender, other, config, progress)
-        if settle(dataset, name, before=standing, promoted=trial.promoted, why=trial.why):
+        found = {"promoted": trial.promoted, "why": trial.why, "learned": learned}
+        if settle(dataset, name, before=standing, **found):
             return trial
     return None
 

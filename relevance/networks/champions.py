@@ -39,6 +39,10 @@ class Event:
     """The champion that stood then; None for none."""
     at: str
     """When, UTC, ISO 8601."""
+    labels: int = 0
+    """Training labels that there were when it began to learn; 0 where nobody counted."""
+    labelling: str = ""
+    """How they were made."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,17 +84,24 @@ def read_record(dataset: Dataset) -> Record:
 
 
 def settle(
-    dataset: Dataset, checkpoint_id: str, *, before: str | None, promoted: bool, why: str
+    dataset: Dataset,
+    checkpoint_id: str,
+    *,
+    before: str | None,
+    promoted: bool,
+    why: str,
+    learned: tuple[int, str] = (0, ""),
 ) -> bool:
     """Enter what became of a contender; False, and nothing entered, where another champion than
-    `before` stands by now."""
+    `before` stands by now. learned: the labels and labelling of its event."""
 
     def change(record: Record) -> Record | None:
         if record.champion != before:
             return None
         line = (*record.line, checkpoint_id) if promoted else record.line
         what = "promoted" if promoted else "refused"
-        return _entered(replace(record, line=line), checkpoint_id, what, why, before)
+        record = replace(record, line=line)
+        return _entered(record, checkpoint_id, what, why, before, learned)
 
     return _change(dataset, change)
 
@@ -130,9 +141,23 @@ def roll_back(dataset: Dataset, why: str) -> str:
     return found[0]
 
 
-def _entered(record: Record, checkpoint_id: str, what: Any, why: str, before: str | None) -> Record:
-    at = datetime.now(UTC).isoformat(timespec="seconds")
-    event = Event(checkpoint_id=checkpoint_id, what=what, why=why, before=before, at=at)
+def _entered(
+    record: Record,
+    checkpoint_id: str,
+    what: Any,
+    why: str,
+    before: str | None,
+    learned: tuple[int, str] = (0, ""),
+) -> Record:
+    event = Event(
+        checkpoint_id=checkpoint_id,
+        what=what,
+        why=why,
+        before=before,
+        at=datetime.now(UTC).isoformat(timespec="seconds"),
+        labels=learned[0],
+        labelling=learned[1],
+    )
     return replace(record, history=(*record.history, event))
 
 

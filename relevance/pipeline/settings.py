@@ -310,6 +310,17 @@ def read_config(dataset: Dataset, key: str, said: Mapping[str, Any]) -> DatasetC
     return _from_description(dataset, key, said, _CONFIG)
 
 
+def fitting_preset(train_scenes: int) -> str:
+    """The preset of training that fits so many scenes: the largest whose dataset has at most twice
+    as many."""
+    fits = "smoke"
+    for name in ("demo", "laptop", "paper"):
+        train: Counts = getattr(DatasetConfig, name)().train
+        if sum(train.of(family) for family in FAMILIES) <= 2 * train_scenes:
+            fits = name
+    return fits
+
+
 def shards_of(dataset: Dataset) -> list[ShardSpec]:
     """Every shard that dataset.json lists, finished or not."""
     return _from_description(dataset, "shards", dataset.description, _SPECS)
