@@ -248,10 +248,11 @@ def _change(
     if champion is None:
         return None
     for name, file in ((contender, path), (champion, find_checkpoint(dataset.path, champion))):
-        if unjudged(dataset, name) or not dataset.files("predictions", name=name, split="test"):
+        scored = dataset.files("predictions", checkpoint_id=name, split="test")
+        if not scored or unjudged(dataset, name):
             predict(dataset.path, file)
     policy = policy_of_checkpoint(dataset, contender)
-    with dataset.connect(policy=policy, names=("judged",)) as connection:
+    with dataset.connect(policy=policy) as connection:
         columns = connection.execute(
             """
             select count(*) as relevant, sum((n.score > 0)::int - (o.score > 0)::int) as gained
