@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from relevance.store import Dataset
 
 Share = Annotated[float, Field(ge=0, le=1)]
-FITTING = "fitting"
 
 
 # Another try begins a trial anew; the record is written at its end alone.
@@ -48,7 +47,7 @@ def try_one(
 @stage()
 def retrain(
     dataset: DatasetPath = "data/demo",
-    preset: Preset | Literal["fitting"] = FITTING,
+    preset: Preset | Literal["fitting"] = "fitting",
     overrides: Overrides | None = None,
     evaluation: Overrides | None = None,
     trial: Overrides | None = None,
@@ -85,7 +84,7 @@ def retrain(
     if pending(there) is not None:
         say("retrain: %s is being planned anew; `relevance label` finishes it", root)
         return rest
-    if preset == FITTING:
+    if preset == "fitting":
         count = sql(root, "select count(*) from scenes where split = 'train'")[1][0][0]
         preset = fitting_preset(count)
         say("retrain: preset %s fits %d training scenes", preset, count)

@@ -210,13 +210,17 @@ def find_checkpoint(root: str | Path, text: str | Path | None = None) -> Path:
     """
     dataset = Dataset.open(root)
     rows = {row["checkpoint_id"]: row for row in dataset.read_rows("checkpoints")}
-    champion = read_record(dataset).champion
     known = ", ".join([*rows, *shipped()]) or "none: nothing was trained yet"
-    if text is None and not rows:
+    if text is None:
+        name = meant(dataset)
+    elif str(text) == CHAMPION:
+        name = read_record(dataset).champion
+    else:
+        name = str(text)
+    if name is None and text is None:
         raise DatasetError(f"{dataset.path}: no checkpoints there, expected `train` first")
-    if str(text) == CHAMPION and champion is None:
+    if name is None:
         raise DatasetError(f"{dataset.path}: no champion yet, expected one of {known}")
-    name = champion if str(text) == CHAMPION else meant(dataset) if text is None else str(text)
     if name in rows:
         return dataset.path / rows[name]["path"]
     path = named(name)
