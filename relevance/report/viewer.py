@@ -113,11 +113,11 @@ class Viewer:
 
     def advance(self, seconds: float) -> None:
         """Go on in time; after the end, from the start."""
-        whole = self.shot.motion.seconds
-        self._now += seconds
-        if self._now > whole + _REST:
-            self._now = 0.0
-        self.time.value = min(self._now, whole)  # which shows it
+        now = self._now + seconds
+        if now > self.shot.motion.seconds + _REST:
+            now = 0.0
+        self.time.value = min(round(now, 2), _longest(self.shot))  # which shows it
+        self._now = now
 
     def choose(self, name: str) -> None:
         """Show another of the plans, from its start."""
@@ -218,4 +218,4 @@ def steps(shot: Shot, current: int) -> str:
 
 def _longest(shot: Shot) -> float:
     """Where the slider ends, s: written short, and one of no length cannot be drawn."""
-    return max(math.ceil(shot.motion.seconds / _STEP) * _STEP, _STEP)
+    return max(round(math.ceil(shot.motion.seconds / _STEP) * _STEP, 2), _STEP)
