@@ -34,7 +34,7 @@ def _champion(_: Preset) -> Callable[..., int]:
             promote: The checkpoint to try, an id or a file.
             rollback: Put the champion before the present one in its place.
             force: Promote without a trial.
-            tasks: Fresh tasks of a trial; 400 take two minutes.
+            tasks: Fresh tasks of a trial; 400 take about a minute of CPU.
             boxes: Boxes of each.
             guide: How scores enter the search: any guide that loses no task.
             format: How to print the history.

@@ -46,7 +46,7 @@ class TrialConfig:
     """How contenders are tried."""
 
     tasks: Annotated[int, Field(ge=2)] = 400
-    """Fresh tasks, predicates in turn: a minute of CPU for each of the two, of 20 boxes."""
+    """Fresh tasks, predicates in turn; with 20 boxes about a minute of CPU for both models."""
     boxes: Annotated[int, Field(ge=3, le=30)] = 20
     """Boxes of each."""
     guide: str = "order"
@@ -69,17 +69,17 @@ class TrialConfig:
 
     @classmethod
     def demo(cls) -> TrialConfig:
-        """Two minutes."""
+        """A minute."""
         return cls()
 
     @classmethod
     def laptop(cls) -> TrialConfig:
-        """Five minutes."""
+        """Three minutes."""
         return cls(tasks=1000)
 
     @classmethod
     def paper(cls) -> TrialConfig:
-        """Ten minutes."""
+        """Six minutes."""
         return cls(tasks=2000)
 
 
