@@ -3,6 +3,8 @@
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 from collections.abc import Callable
 
+import tyro
+
 from relevance.cli.arguments import Command, DatasetArg, OptionalName, Preset, at_least
 from relevance.cli.terminal import Format, UsageError, bar, say, show
 
@@ -15,8 +17,8 @@ def _champion(_: Preset) -> Callable[..., int]:
     def champion(
         dataset: DatasetArg,
         promote: OptionalName = None,
-        rollback: bool = False,
-        force: bool = False,
+        rollback: tyro.conf.FlagCreatePairsOff[bool] = False,
+        force: tyro.conf.FlagCreatePairsOff[bool] = False,
         tasks: int = start.tasks,
         boxes: int = start.boxes,
         guide: str = start.guide,

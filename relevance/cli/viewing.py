@@ -38,8 +38,8 @@ def _view(_: Preset) -> Callable[..., int]:
     ) -> int:
         """Watch a plan: the arm, the boxes and the steps, on a page that this machine serves.
 
-        Without --gif and --mp4 a page opens for your browser (pip install 'relevance[view]') and
-        stays until Ctrl-C; what it shows never leaves this machine. With them the plan becomes a
+        Without --gif and --mp4 there is a page for your browser (pip install 'relevance[view]')
+        until Ctrl-C; what it shows never leaves this machine. With them the plan becomes a
         film: the unguided one, or the guided one where --checkpoint names a model.
 
         Args:
