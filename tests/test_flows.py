@@ -306,6 +306,12 @@ def test_retrain_trains_evaluates_and_then_rests(dataset: Path) -> None:
     assert not second["new"]
     assert second["checkpoint"] == checkpoint.stem
     assert (checkpoint.stat().st_mtime_ns, report.stat().st_mtime_ns) == changed
+    # While it is being planned anew, what it holds now is not worth learning.
+    there = Dataset.open(dataset)
+    before = there.description
+    there.describe({**before, "next": {"config": before["config"]}})
+    assert run()["checkpoint"] is None
+    there.describe(before)
 
 
 def test_a_server_that_does_not_answer_is_named(

@@ -73,7 +73,8 @@ def _champion(_: Preset) -> Callable[..., int]:
         record = read_record(there)
         columns = ("at", "checkpoint", "what", "why")
         rows = [[event.at, event.checkpoint_id, event.what, event.why] for event in record.history]
-        show(columns, rows, format)
+        if rows or format != "table":
+            show(columns, rows, format)
         say(f"champion: {record.champion or 'none yet, the newest checkpoint counts'}")
         return 0
 
