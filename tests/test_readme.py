@@ -28,7 +28,7 @@ NOT_RUN = {
     r"^(make|pip|git clone|apt-get|python3? -m venv)\b|\.venv/": "installs, or runs for minutes",
     r"^(prefect|export PREFECT_)": "needs a server: tests/test_flows.py runs server and worker",
     r"s3://|tcp://|AWS_": "needs an object store or a cluster: tests/test_many.py has both",
-    r"^relevance (demo|dashboard)\b": "serves, or takes minutes: they have tests of their own",
+    r"^relevance (demo|dashboard|view)\b": "serves, or takes minutes: they have tests of their own",
     r"\brai\b": "needs rai, which is an extra: tests/test_rai.py",
     r"^(duckdb|D) ": "the duckdb program is not installed with the project",
     r"^relevance bench\b": "measures for minutes: tests/test_benchmarks.py",

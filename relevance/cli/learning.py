@@ -98,7 +98,7 @@ def _evaluate(preset: Preset) -> Callable[..., int]:
 
         Args:
             dataset: Folder of a labelled dataset.
-            checkpoint: The model, a file or an id; the dataset's newest when not given.
+            checkpoint: The model, a file or an id; the dataset's champion, else its newest.
             preset: Where the other settings start from.
         """
         from relevance import evaluation

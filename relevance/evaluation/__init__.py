@@ -16,6 +16,7 @@ from relevance.evaluation.accuracies import (
     read_predictions,
 )
 from relevance.evaluation.calibration import LEVELS, Calibration, CalibrationError, Promise
+from relevance.evaluation.champion import Trial, TrialConfig, contend, fresh_tasks
 from relevance.evaluation.comparisons import (
     Comparison,
     guided_cost,
@@ -73,6 +74,8 @@ __all__ = [
     "Seen",
     "Suite",
     "Task",
+    "Trial",
+    "TrialConfig",
     "accuracy_table",
     "away",
     "breakdown_table",
@@ -80,9 +83,11 @@ __all__ = [
     "checkpoint_id",
     "choose_tasks",
     "compare",
+    "contend",
     "covered",
     "covered_speeds",
     "evaluate",
+    "fresh_tasks",
     "guided_cost",
     "in_group",
     "left_out",

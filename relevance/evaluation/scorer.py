@@ -20,7 +20,15 @@ import numpy as np
 
 from relevance.errors import RelevanceError, RelevanceWarning
 from relevance.evaluation.calibration import Promise
-from relevance.networks import GraphNetwork, Network, named, read_checkpoint, true_geometry
+from relevance.networks import (
+    CHAMPION,
+    GraphNetwork,
+    Network,
+    find_checkpoint,
+    named,
+    read_checkpoint,
+    true_geometry,
+)
 from relevance.planner import GUIDES, Guide
 from relevance.sampling import same_view, view_of
 from relevance.scene import Goal, Predicate, Scene, lookalikes
@@ -227,7 +235,7 @@ def enter(dataset: Dataset, checkpoint: str | Path, meta: dict[str, Any]) -> Non
     """Give a dataset the row of a checkpoint, where it has none yet."""
     from relevance.training import write_row
 
-    write_row(dataset, Path(checkpoint), meta)
+    write_row(dataset, named(checkpoint), meta)
 
 
 def policy_of(config: dict[str, Any] | None) -> str:
@@ -246,14 +254,21 @@ def load_guide(
     mode: str = "prune-then-full",
     beta: float = 0.0,
     coverage: float | None = None,
+    dataset: str | Path | None = None,
 ) -> Guide:
-    """A guide for `plan` from a checkpoint file; EvaluationError unless beta is finite.
+    """A guide for `plan` from a checkpoint file, a model's name, or a checkpoint of a dataset.
 
-    coverage: instead of a beta, with what probability at least all relevant objects are kept (see
-    `calibration`); for a calibrated checkpoint, and a mode that goes by what is kept.
+    Of a `dataset` it may be an id or "champion". coverage: instead of a beta, with what probability
+    at least all relevant objects are kept (see `calibration`); for a calibrated checkpoint, and a
+    mode that goes by what is kept. Raises EvaluationError unless beta is finite, and where it is
+    not said whose champion is meant.
     """
     if not math.isfinite(beta):
         raise EvaluationError(f"beta: {beta}, expected a finite number")
+    if dataset is not None:
+        checkpoint = find_checkpoint(dataset, checkpoint)
+    elif str(checkpoint) == CHAMPION and not named(checkpoint).exists():
+        raise EvaluationError('load_guide("champion"): expected dataset=, whose champion it is')
     if coverage is not None:
         keeping = [n for n, kind in GUIDES.items() if kind.guided and kind.walk == "levels"]
         if mode in GUIDES and mode not in keeping:

@@ -2,6 +2,7 @@
 
 from relevance.planner.checking import penetration
 from relevance.planner.guides import GUIDES, Guide, GuideError, Mode, Scorer, ask
+from relevance.planner.moments import Moment, Motion
 from relevance.planner.rai.planner import Rai, RaiConfig
 from relevance.planner.result import (
     PLANNER_VERSION,
@@ -27,6 +28,8 @@ __all__ = [
     "Guide",
     "GuideError",
     "Mode",
+    "Moment",
+    "Motion",
     "PlanResult",
     "Planner",
     "PlannerConfig",

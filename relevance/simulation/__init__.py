@@ -3,6 +3,7 @@
 The only part of the project that imports pybullet.
 """
 
+from relevance.simulation.filming import Film, film_camera
 from relevance.simulation.rendering import (
     MIN_VISIBLE_FRACTION,
     MIN_VISIBLE_PIXELS,
@@ -21,12 +22,14 @@ __all__ = [
     "MIN_VISIBLE_PIXELS",
     "RENDERER_VERSION",
     "VIEW_PIXELS",
+    "Film",
     "Note",
     "Renderer",
     "Rendering",
     "Replay",
     "World",
     "WorldError",
+    "film_camera",
     "read_bullet",
     "rejects",
     "replay",
