@@ -17,16 +17,22 @@ from relevance.evaluation.accuracies import (
 )
 from relevance.evaluation.comparisons import (
     Comparison,
+    amortised_costs,
     guided_cost,
     left_out,
+    oracle_cost,
     read_evaluations,
     settings,
     shown_as,
     speed_table,
     summarise,
+    with_oracle,
 )
+from relevance.evaluation.pairing import Asked, Pair, Timed, side_by_side
 from relevance.evaluation.predictions import policy_of_checkpoint, predict, unjudged
+from relevance.evaluation.priors import PRIORS, TRUE, Believing, Prior, prior_scorer
 from relevance.evaluation.reruns import (
+    OWN,
     EvaluationConfig,
     Task,
     choose_tasks,
@@ -40,19 +46,32 @@ from relevance.evaluation.scorer import (
     load_guide,
     load_scorer,
 )
+from relevance.evaluation.tuning import Patience, Tuned, TuningConfig, tune
 
 __all__ = [
     "BREAKDOWNS",
     "JUDGES",
     "NETWORK",
+    "OWN",
+    "PRIORS",
     "RULE",
+    "TRUE",
+    "Asked",
+    "Believing",
     "Comparison",
     "EvaluationConfig",
     "EvaluationError",
     "NetworkScorer",
+    "Pair",
+    "Patience",
     "Predictions",
+    "Prior",
     "Task",
+    "Timed",
+    "Tuned",
+    "TuningConfig",
     "accuracy_table",
+    "amortised_costs",
     "breakdown_table",
     "checkpoint_id",
     "choose_tasks",
@@ -63,13 +82,18 @@ __all__ = [
     "left_out",
     "load_guide",
     "load_scorer",
+    "oracle_cost",
     "policy_of_checkpoint",
     "predict",
+    "prior_scorer",
     "read_evaluations",
     "read_predictions",
     "settings",
     "shown_as",
+    "side_by_side",
     "speed_table",
     "summarise",
+    "tune",
     "unjudged",
+    "with_oracle",
 ]

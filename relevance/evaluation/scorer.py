@@ -20,7 +20,7 @@ import numpy as np
 
 from relevance.errors import RelevanceError, RelevanceWarning
 from relevance.networks import GraphNetwork, Network, named, read_checkpoint, true_geometry
-from relevance.planner import Guide
+from relevance.planner import PATIENCE, Guide, Scorer
 from relevance.sampling import same_view, view_of
 from relevance.scene import Goal, Predicate, Scene, lookalikes
 from relevance.store import Dataset
@@ -49,6 +49,7 @@ class NetworkScorer:
         policy: str = "found",
         offsets: Mapping[str, float] = {},
         yaws: Sequence[float] = (0.0,),
+        patience: int = PATIENCE,
         capacity: int = 64,
     ) -> None:
         self.model = model
@@ -60,9 +61,13 @@ class NetworkScorer:
         decides as validation chose."""
         self.yaws = tuple(yaws)
         """How the robots that it learned from were turned, rad."""
+        self.patience = patience
+        """Work after which a guide that waits should ask it, as validation chose."""
         self.capacity = capacity
         self.seconds = 0.0
         """CPU seconds of the last `scores`, a needed encoding included, rendering left out."""
+        self.seconds_encoding = 0.0
+        """Part of them that all goals of the scene share; 0 where it was encoded already."""
         self._seen: OrderedDict[Hashable, tuple[np.ndarray, np.ndarray]] = OrderedDict()
         self._encodings: OrderedDict[Hashable, Any] = OrderedDict()
         self._warned: set[Hashable] = set()
@@ -114,6 +119,7 @@ class NetworkScorer:
         if key not in self._encodings:
             poses = true_geometry(scene) if self.model.told else None
             self._keep(self._encodings, key, self.model.look(*self._seen[key], poses))
+        self.seconds_encoding = time.process_time() - start
         encoding = self._encodings[key]
         scores = np.empty((len(goals), len(scene.objects)))
         for predicate in dict.fromkeys(goal.predicate for goal in goals):
@@ -198,6 +204,7 @@ def open_checkpoint(checkpoint: str | Path) -> tuple[NetworkScorer, dict[str, An
         policy=policy_of(meta["config"]),
         offsets=meta.get("offsets", {}),
         yaws=meta.get("yaws", (0.0,)),
+        patience=meta.get("patience", PATIENCE),
     )
     return scorer, meta
 
@@ -233,7 +240,14 @@ def checkpoint_id(checkpoint: str | Path) -> str:
 def load_guide(
     checkpoint: str | Path, *, mode: str = "prune-then-full", beta: float = 0.0
 ) -> Guide:
-    """A guide for `plan` from a checkpoint file; EvaluationError unless beta is finite."""
+    """A guide for `plan` from a checkpoint file, of the patience that `tune` chose for it, if it
+    did; EvaluationError unless beta is finite."""
     if not math.isfinite(beta):
         raise EvaluationError(f"beta: {beta}, expected a finite number")
-    return Guide(scorer=load_scorer(checkpoint), mode=mode, beta=beta)
+    return guide_by(load_scorer(checkpoint), mode, beta)
+
+
+def guide_by(scorer: Scorer, mode: str, beta: float = 0.0) -> Guide:
+    """A guide that asks a scorer, with the scorer's own patience where it has one."""
+    patience = getattr(scorer, "patience", PATIENCE)
+    return Guide(scorer=scorer, mode=mode, beta=beta, patience=patience)
