@@ -26,6 +26,7 @@ from relevance.evaluation import (
     TRUE,
     Asked,
     NetworkScorer,
+    prior_name,
     prior_scorer,
     side_by_side,
 )
@@ -62,7 +63,7 @@ class Settings:
             if not GUIDES[name].guided:
                 raise BenchmarkError(f"guides: {name} asks for no scores, expected one that does")
         for name in ("priors", "guides", "searches"):
-            given = getattr(self, name)
+            given = [prior_name(each) for each in getattr(self, name)]
             if not given or len(set(given)) < len(given):
                 raise BenchmarkError(f"{name} {', '.join(given)}: expected distinct ones, some")
 

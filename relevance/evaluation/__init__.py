@@ -22,6 +22,7 @@ from relevance.evaluation.comparisons import (
     left_out,
     oracle_cost,
     read_evaluations,
+    rerun_priors,
     settings,
     shown_as,
     speed_table,
@@ -30,7 +31,7 @@ from relevance.evaluation.comparisons import (
 )
 from relevance.evaluation.pairing import Asked, Pair, Timed, side_by_side
 from relevance.evaluation.predictions import policy_of_checkpoint, predict, unjudged
-from relevance.evaluation.priors import PRIORS, TRUE, Believing, Prior, prior_scorer
+from relevance.evaluation.priors import PRIORS, TRUE, Believing, Prior, prior_name, prior_scorer
 from relevance.evaluation.reruns import (
     OWN,
     EvaluationConfig,
@@ -46,7 +47,7 @@ from relevance.evaluation.scorer import (
     load_guide,
     load_scorer,
 )
-from relevance.evaluation.tuning import Patience, Tuned, TuningConfig, tune
+from relevance.evaluation.tuning import Patience, Tuned, TuningConfig, is_tuned, tune
 
 __all__ = [
     "BREAKDOWNS",
@@ -79,15 +80,18 @@ __all__ = [
     "evaluate",
     "guided_cost",
     "in_group",
+    "is_tuned",
     "left_out",
     "load_guide",
     "load_scorer",
     "oracle_cost",
     "policy_of_checkpoint",
     "predict",
+    "prior_name",
     "prior_scorer",
     "read_evaluations",
     "read_predictions",
+    "rerun_priors",
     "settings",
     "shown_as",
     "side_by_side",

@@ -97,14 +97,28 @@ class Comparison:
         return 1 - 1 / self.speedup_both.value
 
 
-def read_evaluations(dataset: Dataset, checkpoint_id: str) -> list[dict[str, Any]]:
-    """Evaluation rows of a checkpoint, in a fixed order, of one planner and one set of settings.
+def read_evaluations(
+    dataset: Dataset, checkpoint_id: str, prior: str = OWN
+) -> list[dict[str, Any]]:
+    """Evaluation rows of a checkpoint, in a fixed order, of one planner and one set of settings;
+    of its own scores, or of another prior that was rerun beside it (`rerun_priors`).
 
-    What another planner version or other settings made is left out, see `left_out`.
+    What another planner version or other settings made is left out, see `left_out`. Each row has
+    what true labels cost in its place, see `with_oracle`.
     """
+    rows = with_oracle(_current(dataset, checkpoint_id))
+    return [row for row in rows if prior_of(row) == prior]
+
+
+def rerun_priors(dataset: Dataset, checkpoint_id: str) -> list[str]:
+    """The priors that were rerun beside a checkpoint."""
+    return sorted({prior_of(row) for row in _current(dataset, checkpoint_id)} - {OWN})
+
+
+def _current(dataset: Dataset, checkpoint_id: str) -> list[dict[str, Any]]:
     rows = _all_rows(dataset, checkpoint_id)
     kind = _kind(rows)
-    return with_oracle([row for row in rows if _made_by(row) == kind])
+    return [row for row in rows if _made_by(row) == kind]
 
 
 def left_out(dataset: Dataset, checkpoint_id: str) -> list[str]:
@@ -288,13 +302,11 @@ def with_oracle(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def settings(
-    rows: Iterable[dict[str, Any]], prior: str = OWN
+    rows: Iterable[dict[str, Any]],
 ) -> dict[tuple[str, str, float], list[dict[str, Any]]]:
-    """Rows of one prior by (search, guide, beta), in order."""
+    """Rows by (search, guide, beta), in order."""
     found: dict[tuple[str, str, float], list[dict[str, Any]]] = {}
     for row in rows:
-        if prior_of(row) != prior:
-            continue
         found.setdefault((row["search"], row["guide"], row["beta"]), []).append(row)
     return dict(sorted(found.items()))
 

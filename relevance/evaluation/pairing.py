@@ -21,6 +21,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from relevance.evaluation.priors import prior_name
 from relevance.evaluation.scorer import NetworkScorer, guide_by
 from relevance.planner import (
     GUIDES,
@@ -92,7 +93,7 @@ class Pair:
     def row(self, scene: Scene, goal: Goal, kept: int | None = None) -> dict[str, Any]:
         """The columns of `evaluations` that one task and guide decide."""
         return {
-            "prior": self.asked.prior,
+            "prior": prior_name(self.asked.prior),
             "guide": self.asked.mode,
             "beta": self.asked.beta,
             "stop": self.stop,

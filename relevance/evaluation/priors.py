@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from relevance.counters import generator
 from relevance.evaluation.scorer import load_scorer
@@ -74,6 +75,11 @@ def prior_scorer(name: str, moved: Moved = ()) -> Scorer:
     if name in PRIORS or not _is_checkpoint(name):
         return Believing(PRIORS[name], moved)
     return load_scorer(name)
+
+
+def prior_name(name: str) -> str:
+    """What rows and tables call it: of a file its name alone."""
+    return Path(name).stem if name.endswith(".pt") else name
 
 
 def _is_checkpoint(name: str) -> bool:

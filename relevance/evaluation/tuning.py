@@ -125,6 +125,11 @@ def tune(
     )
 
 
+def is_tuned(checkpoint: str | Path) -> bool:
+    """Whether a patience was chosen for a checkpoint."""
+    return "patience" in read_checkpoint(named(checkpoint)).meta
+
+
 def costs(
     scene: Scene,
     goal: Goal,
