@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogFormatter
 
 from relevance.benchmarks.guides import Rerun
 from relevance.benchmarks.runs import Measured, Plot
@@ -73,7 +74,7 @@ class Figures:
     nodes: tuple[float, float, float]
     nlps: tuple[float, float, float]
     sequences: tuple[float, float, float]
-    """Until solved: means over what each solves."""
+    """Until solved: means over tasks that all three solve."""
     sequences_median: tuple[float, float, float]
     actions: tuple[float, float, float]
     """Means over tasks that all three solve."""
@@ -298,9 +299,9 @@ def time_plot(*axes: Axes, found: Sequence[Figures]) -> None:
             style = LINES[_priors(found).index(prior) % len(LINES)]
             _line(ax, [(e.size, e.g) for e in its], f"{guide}, {prior}", GUIDES[guide].color, style)
         _line(ax, [(e.size, e.o) for e in plain], "true labels", PRIORS[TRUE].color, ":")
-        ax.set(yscale="log", xlabel="boxes", ylabel="CPU time a task, mean, ms")
-        ax.set_xticks(sorted({e.size for e in some}))
-    axes[0].legend(loc="upper left")
+        ax.set(ylabel="CPU time a task, mean, ms")
+        _over_boxes(ax, some)
+    axes[0].legend(loc="upper left", handlelength=3)
 
 
 def gain_plot(*axes: Axes, found: Sequence[Figures]) -> None:
@@ -312,9 +313,9 @@ def gain_plot(*axes: Axes, found: Sequence[Figures]) -> None:
             color = PRIORS[TRUE].color if prior == TRUE else GUIDES[guide].color
             name = f"{guide}, {prior}"
             _line(ax, [(e.size, e.gain_wide) for e in its], name, color, style)
-        ax.set(yscale="log", xlabel="boxes", ylabel="unguided over guided time")
-        ax.set_xticks(sorted({e.size for e in some}))
-    axes[0].legend(loc="upper left")
+        ax.set(ylabel="unguided over guided time")
+        _over_boxes(ax, some)
+    axes[0].legend(loc="upper left", handlelength=3)
 
 
 def solved_plot(*axes: Axes, rows: Sequence[Rerun]) -> None:
@@ -338,7 +339,7 @@ def solved_plot(*axes: Axes, rows: Sequence[Rerun]) -> None:
             _solved(ax, done, len(its), f"{guide}, {prior}", color, style)
         ax.set_title(f"{search}, {min(row.size for row in some)} boxes and more")
         ax.set(xscale="log", xlabel="CPU time, ms", ylabel="share of tasks solved", ylim=(0, 1.02))
-    axes[0].legend(loc="lower right")
+    axes[0].legend(loc="lower right", handlelength=3)
 
 
 def _panels(axes: Sequence[Axes], found: Sequence[Figures]) -> list[tuple[Axes, list[Figures]]]:
@@ -350,6 +351,13 @@ def _panels(axes: Sequence[Axes], found: Sequence[Figures]) -> list[tuple[Axes, 
     for (ax, _), search in zip(panels, searches, strict=True):
         ax.set_title(search)
     return panels
+
+
+def _over_boxes(ax: Axes, some: Sequence[Figures]) -> None:
+    ax.set(yscale="log", xlabel="boxes")
+    ax.set_xticks(sorted({each.size for each in some}))
+    for axis_format in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+        axis_format(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.5)))
 
 
 def _lines(some: Sequence[Figures]) -> list[tuple[str, str, list[Figures]]]:

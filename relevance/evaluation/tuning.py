@@ -6,6 +6,7 @@ weights give equal answers on any machine. It is kept in the checkpoint's file, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -118,11 +119,20 @@ def tune(
             if progress:
                 progress(done, len(tasks))
     tried = tuple(total.values())
-    best = min(tried, key=lambda one: (one.work, one.patience)).patience
-    _keep(path, best)
-    return Tuned(
-        patience=best, runs=len(tasks) * len(config.searches), unguided=unguided, tried=tried
+    tuned = Tuned(
+        patience=chosen(tried),
+        runs=len(tasks) * len(config.searches),
+        unguided=unguided,
+        tried=tried,
     )
+    _keep(path, tuned.patience)
+    return tuned
+
+
+def chosen(tried: Sequence[Patience]) -> int:
+    """The smallest patience that costs hardly more work than the one that costs least."""
+    least = min(one.work for one in tried)
+    return min(one.patience for one in tried if one.work <= NEARLY * least)
 
 
 def is_tuned(checkpoint: str | Path) -> bool:
