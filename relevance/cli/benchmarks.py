@@ -24,8 +24,9 @@ Recipes = Annotated[tuple[str, ...], tyro.conf.arg(metavar="RECIPE")]
 Seeds = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N")]
 Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")]
 Sizes = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N")]
-EVERY = 120.0
-"""Seconds after which tables and plots of a run that goes on are written again."""
+EVERY, SHARE = 120.0, 0.05
+"""Seconds after which tables and plots of a run that goes on are written again, and the most of its
+time that this takes."""
 OptionalFolder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")]
 
 
@@ -47,7 +48,7 @@ def _guides(_: Preset) -> Callable[..., int]:
 
         Each task is planned unguided, with every prior and guide, and with true labels, in turns in
         one process. Prints tables and writes them (summary.json), one row a run (guides.csv), the
-        scenes and plots, again every two minutes: a killed run goes on with --out and the same
+        scenes and plots, now and then: a killed run goes on with --out and the same
         settings, more tasks or sizes included. For steady times let nothing else run.
 
         Args:
@@ -89,7 +90,7 @@ def _guides(_: Preset) -> Callable[..., int]:
             repeats=repeats,
             planner=PlannerConfig(node_limit=node_limit, max_actions=max_actions),
         )
-        rows, written = [], time.monotonic()
+        rows, due = [], time.monotonic() + EVERY
         with bar("tasks") as progress:
             for rows in benchmarks.rerun_guides(
                 settings,
@@ -99,9 +100,10 @@ def _guides(_: Preset) -> Callable[..., int]:
                 scenes=partial(write_scenes, folder / "scenes.jsonl", mode="a"),
                 progress=progress,
             ):
-                if time.monotonic() - written > EVERY:
+                if (began := time.monotonic()) > due:
                     write(benchmarks.measured_guides(rows), folder, summary=True)
-                    written = time.monotonic()
+                    took = time.monotonic() - began
+                    due = began + took + max(EVERY, took / SHARE)
         hand_over(benchmarks.measured_guides(rows), folder, summary=True)
         return 0
 
