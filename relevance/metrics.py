@@ -233,7 +233,7 @@ def bootstrap(
 def over_groups(
     groups: Sequence[Hashable],
     statistic: Callable[..., Any],
-    *columns: Sequence[float],
+    *columns: Sequence[float] | np.ndarray,
     confidence: float = CONFIDENCE,
 ) -> Interval:
     """A statistic of columns (n,) with the interval that drawing whole groups gives: what belongs

@@ -130,6 +130,7 @@ def rerun(task, prior, *, u, g, look=0.0, solved=(True, True), scene="s", **more
         status_unguided="solved" if solved[0] else "limit",
         status_guided="solved" if solved[1] else "limit",
         seconds_unguided=u, seconds_guided=g, seconds_inference=look, seconds_encoding=look / 2,
+        work_unguided=10_000, work_guided=4_000 if prior == "true" else 5_000,
         nodes_unguided=100, nodes_guided=10, nlps_unguided=6, nlps_guided=3,
         sequences_unguided=4, sequences=1,
         n_actions_unguided=4, n_actions_guided=4,
@@ -147,7 +148,7 @@ def test_figures_by_hand():
         rerun(2, "glimpse", u=0.020, g=0.001, look=0.001, solved=(True, False), scene="t"),
         rerun(2, "true", u=0.020, g=0.006, scene="t"),
         rerun(3, "glimpse", u=0.100, g=0.020, look=0.001, solved=(False, True), scene="t"),
-        rerun(3, "true", u=0.100, g=0.008, scene="t"),
+        rerun(3, "true", u=0.100, g=0.008, solved=(False, True), scene="t"),
     ]
     network, oracle = figures(rows)
     assert (network.prior, oracle.prior) == ("glimpse", "true")
@@ -165,6 +166,8 @@ def test_figures_by_hand():
     assert network.solved == (3, 3, 4)
     assert network.limit == (1, 1, 0)
     assert network.sequences == (4.0, 1.0, 1.0)
+    assert network.work == pytest.approx((10.0, 5.0, 4.0))
+    assert network.worked.value == pytest.approx(5 / 6)
     assert network.gain_wide.low <= network.gain.low <= network.gain.value
     [limit] = [t for t in measured_guides(rows).tables if t.name == "guides-limit"]
     assert [line[4] for line in limit.rows] == [2, 3, 3]

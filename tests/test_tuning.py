@@ -23,7 +23,7 @@ from relevance.evaluation import (
 )
 from relevance.evaluation.tuning import PRICE, chosen
 from relevance.networks import read_checkpoint
-from relevance.planner import PATIENCE, plan
+from relevance.planner import PATIENCE, Guide, plan
 from relevance.store import Dataset
 from relevance.training import load_checkpoint
 
@@ -71,7 +71,7 @@ def test_what_a_patience_costs_is_the_work_of_its_plans_and_the_price_of_their_l
         planner = replace(config.planner, search="tree", stop="first")
         unguided += plan(sample.scene, task.goal, config=planner, replay=False).counts.work
         for patience in config.patiences:
-            guide = replace(load_guide(checkpoint, mode="lazy"), scorer=scorer, patience=patience)
+            guide = Guide(scorer=scorer, mode="lazy", patience=patience)
             found = plan(sample.scene, task.goal, config=planner, guide=guide, replay=False)
             once, each = PRICE[False]
             price = (once + each * len(sample.scene.objects)) * found.looked

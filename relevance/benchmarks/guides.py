@@ -92,6 +92,10 @@ class Rerun:
     seconds_encoding: float
     """Part of the look that all goals of the scene share."""
     looked: bool
+    work_unguided: int
+    """As `Counts.work` has it: what the times would be on a machine without other load."""
+    work_guided: int
+    """The look is no part of it."""
     nodes_unguided: int
     nodes_guided: int
     nlps_unguided: int
@@ -220,6 +224,8 @@ def _rerun(
                 "patience": pair.asked.guide.patience,
                 "status_unguided": pair.unguided.result.status,
                 "status_guided": pair.guided.result.status,
+                "work_unguided": pair.unguided.result.counts.work,
+                "work_guided": pair.guided.result.counts.work,
                 "truth": true.status == "solved",
             }
             yield Rerun(**{name: made[name] for name in _COLUMNS})

@@ -71,6 +71,10 @@ class Figures:
     limit: tuple[int, int, int]
     """At the node limit, likewise."""
     looked: float
+    work: tuple[float, float, float]
+    """By u, g and o, thousands; looks are no part of it."""
+    worked: Interval
+    """Share of u - o in work that g saves, 95%: no clock has a part in it."""
     nodes: tuple[float, float, float]
     nlps: tuple[float, float, float]
     sequences: tuple[float, float, float]
@@ -159,6 +163,14 @@ def _figures(search: str, size: int, prior: str, guide: str, rows: list[dict[str
         solved=count("status", "solved"),
         limit=count("status", "limit"),
         looked=float(np.mean([row["looked"] for row in rows])),
+        work=three("work", rows, lambda values: 1e-3 * np.mean(values)),
+        worked=saving_reached(
+            scenes,
+            [row["work_unguided"] for row in rows],
+            [row["work_guided"] for row in rows],
+            [row["oracle"]["work_guided"] for row in rows],
+            confidence=WIDE,
+        ),
         nodes=three("nodes", rows),
         nlps=three("nlps", rows),
         sequences=three("sequences", all_solve),
@@ -242,6 +254,8 @@ def work_table(found: Sequence[Figures]) -> Table:
     lines = [
         (
             *_of(each),
+            _three(each.work, ".1f"),
+            _share(each.worked),
             _three(each.nodes, ".0f"),
             _three(each.nlps, ".2f"),
             _three(each.sequences, ".2f"),
@@ -250,7 +264,16 @@ def work_table(found: Sequence[Figures]) -> Table:
         )
         for each in found
     ]
-    columns = (*_OF, "nodes", "NLPs", "sequences", "sequences, median", "actions")
+    columns = (
+        *_OF,
+        "work, 1000",
+        "of u - o (95%)",
+        "nodes",
+        "NLPs",
+        "sequences",
+        "sequences, median",
+        "actions",
+    )
     title = (
         "Work a task, means of u / g / o; sequences tried until solved and actions: where all "
         "three solve"
