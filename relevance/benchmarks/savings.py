@@ -334,7 +334,7 @@ def gain_plot(*axes: Axes, found: Sequence[Figures]) -> None:
         for prior, guide, its in _lines(some):
             style = LINES[_priors(found).index(prior) % len(LINES)]
             color = PRIORS[TRUE].color if prior == TRUE else GUIDES[guide].color
-            name = f"{guide}, {prior}"
+            name = "true labels" if prior == TRUE else f"{guide}, {prior}"
             _line(ax, [(e.size, e.gain_wide) for e in its], name, color, style)
         ax.set(ylabel="unguided over guided time")
         _over_boxes(ax, some)
@@ -348,9 +348,7 @@ def solved_plot(*axes: Axes, rows: Sequence[Rerun]) -> None:
     for ax, search in zip(axes, searches, strict=True):
         some = [row for row in rows if row.search == search]
         some = [row for row in some if row.size >= LARGE] or some
-        pairs = sorted({(row.prior, row.guide) for row in some})
-        if not pairs:
-            continue
+        pairs = _distinct(sorted({(row.prior, row.guide) for row in some}))
         plain = [row for row in some if (row.prior, row.guide) == pairs[0]]
         done = [row.seconds_unguided for row in plain if row.solved_unguided]
         _solved(ax, done, len(plain), "unguided", GUIDES["none"].color, "-")
@@ -359,7 +357,8 @@ def solved_plot(*axes: Axes, rows: Sequence[Rerun]) -> None:
             done = [row.seconds_guided for row in its if row.solved_guided]
             color = PRIORS[TRUE].color if prior == TRUE else GUIDES[guide].color
             style = LINES[priors.index(prior) % len(LINES)]
-            _solved(ax, done, len(its), f"{guide}, {prior}", color, style)
+            name = "true labels" if prior == TRUE else f"{guide}, {prior}"
+            _solved(ax, done, len(its), name, color, style)
         ax.set_title(f"{search}, {min(row.size for row in some)} boxes and more")
         ax.set(xscale="log", xlabel="CPU time, ms", ylabel="share of tasks solved", ylim=(0, 1.02))
     axes[0].legend(loc="lower right", handlelength=3)
@@ -384,11 +383,20 @@ def _over_boxes(ax: Axes, some: Sequence[Figures]) -> None:
 
 
 def _lines(some: Sequence[Figures]) -> list[tuple[str, str, list[Figures]]]:
-    pairs = dict.fromkeys((each.prior, each.guide) for each in some)
+    pairs = _distinct([(each.prior, each.guide) for each in some])
     return [
         (prior, guide, [e for e in some if (e.prior, e.guide) == (prior, guide)])
         for prior, guide in pairs
     ]
+
+
+def _distinct(pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Each once; with true labels a guide that waits does as one that does not: one of them."""
+    found: dict[tuple[str, str | bool], tuple[str, str]] = {}
+    for prior, guide in pairs:
+        alike = prior == TRUE and GUIDES[guide].first
+        found.setdefault((prior, alike or guide), (prior, guide))
+    return list(found.values())
 
 
 def _priors(found: Sequence[Figures]) -> list[str]:
