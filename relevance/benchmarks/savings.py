@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import FuncFormatter
 
 from relevance.benchmarks.guides import Rerun
 from relevance.benchmarks.runs import Measured, Plot
@@ -378,8 +378,8 @@ def _panels(axes: Sequence[Axes], found: Sequence[Figures]) -> list[tuple[Axes, 
 def _over_boxes(ax: Axes, some: Sequence[Figures]) -> None:
     ax.set(yscale="log", xlabel="boxes")
     ax.set_xticks(sorted({each.size for each in some}))
-    for axis_format in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
-        axis_format(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.5)))
+    for written in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+        written(FuncFormatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "125" else ""))
 
 
 def _lines(some: Sequence[Figures]) -> list[tuple[str, str, list[Figures]]]:
