@@ -1,4 +1,4 @@
-"""Subcommands about models: train, ship, evaluate, calibrate, coverage."""
+"""Subcommands about models: train, ship, tune, evaluate, calibrate, coverage."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 from collections.abc import Callable
@@ -81,6 +81,47 @@ def _ship(preset: str, body: str | None = None) -> Callable[..., int]:
         return 0
 
     return ship
+
+
+def _tune(_: Preset) -> Callable[..., int]:
+    from relevance.evaluation import TuningConfig
+
+    start = TuningConfig()
+
+    def tune(
+        dataset: DatasetArg,
+        checkpoint: OptionalPath = None,
+        config: Annotated[TuningConfig, tyro.conf.arg(name="")] = start,
+    ) -> int:
+        """Choose when a lazy guide looks: the work that saves most on validation tasks.
+
+        It is kept in the checkpoint's file, where guides find it; its id stays.
+
+        Args:
+            dataset: Folder of a labelled dataset.
+            checkpoint: The model, a file or an id; the dataset's newest when not given.
+        """
+        from relevance import evaluation
+        from relevance.training import find_checkpoint
+
+        path = find_checkpoint(dataset, checkpoint)
+        with bar("tasks") as progress:
+            tuned = evaluation.tune(dataset, path, config, progress=progress)
+        columns = ("patience", "work a task", "of unguided", "looked")
+        rows = [
+            (
+                one.patience,
+                one.work / tuned.runs,
+                one.work / max(tuned.unguided, 1),
+                one.looks / tuned.runs,
+            )
+            for one in tuned.tried
+        ]
+        show(columns, rows, "table", title=f"{tuned.runs} runs, to the first plan, looks included")
+        say(f"{path}: a lazy guide looks after work of {tuned.patience}")
+        return 0
+
+    return tune
 
 
 def _evaluate(preset: Preset) -> Callable[..., int]:
@@ -247,6 +288,11 @@ COMMANDS = {
         examples=("relevance ship data/tables --preset laptop --model.body geometry",),
         presets=(*get_args(Preset), "fair"),
         decides=("--model.body",),
+    ),
+    "tune": Command(
+        make=_tune,
+        about="choose when a lazy guide looks",
+        examples=("relevance tune data/tables", "relevance tune data/tables --tasks 100"),
     ),
     "evaluate": Command(
         make=_evaluate,

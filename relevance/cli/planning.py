@@ -139,6 +139,7 @@ def plan_line(scene_id: str, result: Any) -> dict[str, Any]:
         "ambiguous": result.ambiguous,
         "seconds": result.seconds.total,
         "counts": counts,
+        "looked": result.looked,
         "replay": verdict
         and {
             "ok": verdict.ok,

@@ -19,13 +19,17 @@ from relevance.evaluation.calibration import LEVELS, Calibration, CalibrationErr
 from relevance.evaluation.champion import Trial, TrialConfig, contend, fresh_tasks
 from relevance.evaluation.comparisons import (
     Comparison,
+    amortised_costs,
     guided_cost,
     left_out,
+    oracle_cost,
     read_evaluations,
+    rerun_priors,
     settings,
     shown_as,
     speed_table,
     summarise,
+    with_oracle,
 )
 from relevance.evaluation.coverage import (
     Covered,
@@ -35,9 +39,12 @@ from relevance.evaluation.coverage import (
     out_of_reach,
     read_calibration,
 )
+from relevance.evaluation.pairing import Asked, Pair, Timed, side_by_side
 from relevance.evaluation.pictures import PictureError, Seen, look_at
 from relevance.evaluation.predictions import policy_of_checkpoint, predict, unjudged
+from relevance.evaluation.priors import PRIORS, TRUE, Believing, Prior, prior_name, prior_scorer
 from relevance.evaluation.reruns import (
+    OWN,
     EvaluationConfig,
     Task,
     choose_tasks,
@@ -53,14 +60,20 @@ from relevance.evaluation.scorer import (
 )
 from relevance.evaluation.scores import scores
 from relevance.evaluation.suites import SUITES, Suite, away, suite_of
+from relevance.evaluation.tuning import Patience, Tuned, TuningConfig, is_tuned, tune
 
 __all__ = [
     "BREAKDOWNS",
     "JUDGES",
     "LEVELS",
     "NETWORK",
+    "OWN",
+    "PRIORS",
     "RULE",
     "SUITES",
+    "TRUE",
+    "Asked",
+    "Believing",
     "Calibration",
     "CalibrationError",
     "Comparison",
@@ -68,15 +81,22 @@ __all__ = [
     "EvaluationConfig",
     "EvaluationError",
     "NetworkScorer",
+    "Pair",
+    "Patience",
     "PictureError",
     "Predictions",
+    "Prior",
     "Promise",
     "Seen",
     "Suite",
     "Task",
+    "Timed",
     "Trial",
     "TrialConfig",
+    "Tuned",
+    "TuningConfig",
     "accuracy_table",
+    "amortised_costs",
     "away",
     "breakdown_table",
     "calibrate",
@@ -90,21 +110,29 @@ __all__ = [
     "fresh_tasks",
     "guided_cost",
     "in_group",
+    "is_tuned",
     "left_out",
     "load_guide",
     "load_scorer",
     "look_at",
+    "oracle_cost",
     "out_of_reach",
     "policy_of_checkpoint",
     "predict",
+    "prior_name",
+    "prior_scorer",
     "read_calibration",
     "read_evaluations",
     "read_predictions",
+    "rerun_priors",
     "scores",
     "settings",
     "shown_as",
+    "side_by_side",
     "speed_table",
     "suite_of",
     "summarise",
+    "tune",
     "unjudged",
+    "with_oracle",
 ]

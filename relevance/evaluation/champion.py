@@ -30,7 +30,7 @@ from relevance.evaluation.predictions import (
     unjudged,
 )
 from relevance.evaluation.scorer import EvaluationError, NetworkScorer, load_scorer
-from relevance.metrics import Interval, bootstrap, ratio_interval
+from relevance.metrics import Interval, bootstrap, ratio_of_sums
 from relevance.networks import find_checkpoint, read_record, settle
 from relevance.pipeline import load_config
 from relevance.planner import GUIDES, Guide, PlannerConfig, plan
@@ -238,7 +238,8 @@ def _spent(
 def _ratio(pairs: Sequence[Sequence[tuple[int, bool]]], confidence: float) -> Interval:
     """Work over work of the tasks that either solved."""
     solved = [(mine[0], its[0]) for mine, its in pairs if mine[1] or its[1]]
-    return ratio_interval([a for a, _ in solved], [b for _, b in solved], confidence=confidence)
+    mine, its = np.array(solved, dtype=float).reshape(-1, 2).T
+    return bootstrap((mine, its), ratio_of_sums, confidence=confidence)
 
 
 def _change(

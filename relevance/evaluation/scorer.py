@@ -29,7 +29,7 @@ from relevance.networks import (
     read_checkpoint,
     true_geometry,
 )
-from relevance.planner import GUIDES, Guide
+from relevance.planner import GUIDES, PATIENCE, Guide, Scorer
 from relevance.sampling import same_view, view_of
 from relevance.scene import Goal, Predicate, Scene, lookalikes
 from relevance.store import Dataset
@@ -58,6 +58,7 @@ class NetworkScorer:
         policy: str = "found",
         offsets: Mapping[str, float] = {},
         yaws: Sequence[float] = (0.0,),
+        patience: int = PATIENCE,
         capacity: int = 64,
     ) -> None:
         self.model = model
@@ -69,12 +70,16 @@ class NetworkScorer:
         decides as validation chose."""
         self.yaws = tuple(yaws)
         """How the robots that it learned from were turned, rad."""
+        self.patience = patience
+        """Work after which a guide that waits should ask it, as validation chose."""
         self.capacity = capacity
         self.promise: Promise | None = None
         """A coverage, where it is asked for: its betas are then part of every score, so that
         beta = 0 keeps what was promised."""
         self.seconds = 0.0
         """CPU seconds of the last `scores`, a needed encoding included, rendering left out."""
+        self.seconds_encoding = 0.0
+        """Part of them that all goals of the scene share; 0 where it was encoded already."""
         self._seen: OrderedDict[Hashable, tuple[np.ndarray, np.ndarray]] = OrderedDict()
         self._encodings: OrderedDict[Hashable, Any] = OrderedDict()
         self._warned: set[Hashable] = set()
@@ -127,6 +132,7 @@ class NetworkScorer:
         if key not in self._encodings:
             poses = true_geometry(scene) if self.model.told else None
             self._keep(self._encodings, key, self.model.look(*self._seen[key], poses))
+        self.seconds_encoding = time.process_time() - start
         encoding = self._encodings[key]
         scores = np.empty((len(goals), len(scene.objects)))
         for predicate in dict.fromkeys(goal.predicate for goal in goals):
@@ -211,6 +217,7 @@ def open_checkpoint(checkpoint: str | Path) -> tuple[NetworkScorer, dict[str, An
         policy=policy_of(meta["config"]),
         offsets=meta.get("offsets", {}),
         yaws=meta.get("yaws", (0.0,)),
+        patience=meta.get("patience", PATIENCE),
     )
     return scorer, meta
 
@@ -260,8 +267,8 @@ def load_guide(
 
     Of a `dataset` it may be an id or "champion". coverage: instead of a beta, with what probability
     at least all relevant objects are kept (see `calibration`); for a calibrated checkpoint, and a
-    mode that goes by what is kept. Raises EvaluationError unless beta is finite, and where it is
-    not said whose champion is meant.
+    mode that goes by what is kept. Its patience is what `tune` chose for it, if it did. Raises
+    EvaluationError unless beta is finite, and where it is not said whose champion is meant.
     """
     if not math.isfinite(beta):
         raise EvaluationError(f"beta: {beta}, expected a finite number")
@@ -277,4 +284,10 @@ def load_guide(
             )
         if beta:
             raise EvaluationError(f"coverage {coverage:g} and beta {beta:g}: expected one of them")
-    return Guide(scorer=load_scorer(checkpoint, coverage=coverage), mode=mode, beta=beta)
+    return guide_by(load_scorer(checkpoint, coverage=coverage), mode, beta)
+
+
+def guide_by(scorer: Scorer, mode: str, beta: float = 0.0) -> Guide:
+    """A guide that asks a scorer, with the scorer's own patience where it has one."""
+    patience = getattr(scorer, "patience", PATIENCE)
+    return Guide(scorer=scorer, mode=mode, beta=beta, patience=patience)

@@ -1,7 +1,7 @@
 """Logic-Geometric Programming over pick and place: `plan(scene, goal)`."""
 
 from relevance.planner.checking import penetration
-from relevance.planner.guides import GUIDES, Guide, GuideError, Mode, Scorer, ask
+from relevance.planner.guides import GUIDES, PATIENCE, Guide, GuideError, Mode, Scorer, ask
 from relevance.planner.moments import Moment, Motion
 from relevance.planner.rai.planner import Rai, RaiConfig
 from relevance.planner.result import (
@@ -22,6 +22,7 @@ for _planner in (Ours(), Rai()):
 
 __all__ = [
     "GUIDES",
+    "PATIENCE",
     "PLANNERS",
     "PLANNER_VERSION",
     "Counts",
