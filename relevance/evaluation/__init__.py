@@ -40,6 +40,7 @@ from relevance.evaluation.scorer import (
     load_guide,
     load_scorer,
 )
+from relevance.evaluation.working_points import SweptTask, WorkingPoint, saved, swept, working_point
 
 __all__ = [
     "BREAKDOWNS",
@@ -51,7 +52,9 @@ __all__ = [
     "EvaluationError",
     "NetworkScorer",
     "Predictions",
+    "SweptTask",
     "Task",
+    "WorkingPoint",
     "accuracy_table",
     "breakdown_table",
     "checkpoint_id",
@@ -67,9 +70,12 @@ __all__ = [
     "predict",
     "read_evaluations",
     "read_predictions",
+    "saved",
     "settings",
     "shown_as",
     "speed_table",
     "summarise",
+    "swept",
     "unjudged",
+    "working_point",
 ]

@@ -15,6 +15,7 @@ from relevance.evaluation import (
     read_predictions,
     unjudged,
 )
+from relevance.networks import CheckpointError, read_checkpoint
 from relevance.report import plots
 from relevance.store import Dataset
 
@@ -34,7 +35,7 @@ def network_section(
         "plots": {},
         "notes": unjudged(dataset, chosen) if chosen else [],
     }
-    history = _history(dataset, model["chosen"])
+    history = training_history(dataset, model["chosen"])
     if history:
         model["plots"]["training"] = plots.svg("training", plots.training_curve, history=history)
     everything = read_predictions(dataset, chosen or "")
@@ -66,13 +67,11 @@ def network_section(
     return model
 
 
-def _history(dataset: Dataset, chosen: Mapping[str, Any] | None) -> list[dict[str, float]]:
-    """The training curve that the checkpoint's file holds; empty without the file."""
-    from relevance.training import CheckpointError, load_checkpoint  # torch: only for this curve
-
+def training_history(dataset: Dataset, chosen: Mapping[str, Any] | None) -> list[dict[str, float]]:
+    """The training curve that a checkpoint's file holds; empty without the file."""
     if chosen is None:
         return []
     try:
-        return load_checkpoint(dataset.path / chosen["path"])[1].get("history", [])
+        return read_checkpoint(dataset.path / chosen["path"]).meta.get("history", [])
     except CheckpointError:  # a dataset may travel without its weights
         return []
