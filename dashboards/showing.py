@@ -33,8 +33,9 @@ def figures(*shown: tuple[str, str, str], columns: int = 0) -> None:
     """Headline figures side by side: label, value, and what it rests on."""
     places = st.columns(max(len(shown), columns))
     for column, (label, value, note) in zip(places, shown, strict=False):
-        column.metric(label, value)
-        column.caption(plain(note))
+        with column.container(gap=None):
+            st.metric(label, value)
+            st.caption(plain(note))
 
 
 def drawing(svg: str, *, width: int = 620) -> None:
@@ -52,7 +53,7 @@ def plot(name: str, draw: Callable[..., None], **given: Any) -> None:
 
 def command(*lines: str) -> None:
     """Lines for a shell."""
-    st.code("\n".join(lines), language="sh")
+    st.code("\n".join(lines), language="sh", wrap_lines=True)
 
 
 def lacking(said: str, *lines: str) -> None:

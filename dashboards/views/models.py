@@ -39,7 +39,8 @@ TITLES = {
     "objects": "objects",
 }
 SHARES = " ".join(list(TITLES)[:-2])
-DRAWN = ("predicate", "n_objects", "visible", "stands")
+DRAWN = ("n_objects", "predicate", "stands", "visible")
+"""Breakdowns that are drawn, in the order in which they fill the columns."""
 
 
 @st.cache_data(show_spinner=False, max_entries=8)
@@ -166,13 +167,13 @@ rows = [
 others = [name for name in checkpoints if name != choice.checkpoint]
 if st.session_state["pick_other"] not in others:
     st.session_state["pick_other"] = None
-other = st.selectbox(
-    "Beside it",
-    [None, *others],
-    format_func=lambda name: name or "no other",
+other = st.columns(2)[0].selectbox(
+    "Compare with",
+    others,
+    index=None,
+    placeholder="another checkpoint, side by side" if others else "there is no other checkpoint",
     key="pick_other",
     disabled=not others,
-    help="A second checkpoint, to compare.",
 )
 if len({row["checkpoint_id"] for row in rows}) > 1:
     with st.container(border=True):

@@ -23,7 +23,6 @@ from relevance.evaluation import (
     saved,
     settings,
     speed_table,
-    summarise,
     swept,
     working_point,
 )
@@ -67,15 +66,15 @@ def figures_of(path: str, version: tuple[int, int], checkpoint: str) -> list[dic
 @st.cache_resource(show_spinner=False, max_entries=8)
 def reruns(
     path: str, version: tuple[int, int], checkpoint: str, split: str, policy: str | None
-) -> tuple[dict[str, list[SweptTask]], dict[str, list[tuple[float, float]]]]:
-    """Tasks that `prune` was rerun on, and (beta, speed-up) of its reruns, both by search."""
+) -> tuple[dict[str, list[SweptTask]], dict[str, list[float]]]:
+    """Tasks that `prune` was rerun on, and at which betas, both by search."""
     choice = Choice(path=path, version=version, policy=policy)
     rows = read_evaluations(choice.dataset, checkpoint)
     scored = ask(choice, "task_scores", checkpoint_id=checkpoint, split=split)
-    measured: dict[str, list[tuple[float, float]]] = {}
-    for (search, guide, beta), of in settings(rows).items():
+    measured: dict[str, list[float]] = {}
+    for search, guide, beta in settings(rows):
         if guide == "prune":
-            measured.setdefault(search, []).append((beta, summarise(of).speedup.value))
+            measured.setdefault(search, []).append(beta)
     return swept(rows, scored), measured
 
 
@@ -111,8 +110,8 @@ def working(choice: Choice) -> None:
                 "Speed-up of prune",
                 f"{interval.value:.2f}{TIMES}",
                 f"{interval.low:.2f} to {interval.high:.2f}; {point.misses} of {point.n_tasks} "
-                f"goals missed, each planned again; {percent(point.exact, 0)} of them measured at "
-                "just these objects, the rest between",
+                f"goals missed and planned again; {percent(point.exact, 0)} measured with just "
+                "these objects",
             )
         )
     else:
@@ -164,8 +163,10 @@ def missed(choice: Choice) -> None:
         for column, (task, sample) in row:
             with column:
                 st.image(picture(task, sample, choice.beta), width="stretch")
-                scored = [f"{name} {task['scores'][name]:+.1f}" for name in task["left_out"]]
-                st.markdown(f"**{plain(goal_of(task))}** leaves out {plain(', '.join(scored))}")
+                scored = [
+                    f"{name} (score {task['scores'][name]:+.1f})" for name in task["left_out"]
+                ]
+                st.markdown(f"**{plain(goal_of(task))}** left out: {plain(', '.join(scored))}")
 
 
 choice = chosen()

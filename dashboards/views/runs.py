@@ -59,8 +59,8 @@ def runs(url: str) -> None:
     one, two, three = st.columns([2, 2, 2], vertical_alignment="bottom")
     flows = sorted({run.flow for run in found})
     states = sorted({run.state for run in found})
-    flow = one.multiselect("Flows", flows, placeholder="all")
-    state = two.multiselect("States", states, placeholder="any")
+    flow = one.multiselect("Flows", flows, key="runs_flows", placeholder="all")
+    state = two.multiselect("States", states, key="runs_states", placeholder="any")
     mine = three.toggle("Only of this dataset")
     here = Path(choice.path).resolve()
     shown = [
@@ -118,6 +118,7 @@ url = st.text_input("Prefect server", server())
 try:
     runs(url)
 except NoAnswer as error:
-    st.info(plain(str(error)))
-    st.write("Flows run without a server, too, and leave nothing here then. To keep their runs:")
+    st.info("No Prefect server answers there, so there are no flow runs to show.")
+    st.caption(plain(str(error)))
+    st.write("Flows run without a server, too, but leave nothing here then. To keep their runs:")
     command("prefect server start", f"export PREFECT_API_URL={url}", "make deploy")

@@ -76,10 +76,11 @@ found = rows[0]["found"]
 (task, sample), *others = tasks_with_answers(choice, rows)
 
 back, which, on, _ = st.columns([1, 2, 1, 6], vertical_alignment="bottom")
-back.button("Back", disabled=number <= 1, on_click=place, args=[number - 1], width="stretch")
+turn = {"on_click": place, "width": "stretch"}
+back.button("Back", key="back", disabled=number <= 1, args=[number - 1], **turn)
 st.session_state["pick_place"] = number
 which.number_input(f"Goal, of {found:,}", 1, found, key="pick_place")
-on.button("Next", disabled=number >= found, on_click=place, args=[number + 1], width="stretch")
+on.button("Next", key="next", disabled=number >= found, args=[number + 1], **turn)
 
 large, beside = st.columns([3, 2], gap="large")
 with large:

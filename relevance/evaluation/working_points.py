@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 from typing import Any
 
 from relevance.metrics import Interval, ratio_interval
@@ -135,19 +136,15 @@ def _name(row: Mapping[str, Any]) -> tuple[Any, ...]:
 def _task(rows: Sequence[Mapping[str, Any]], scored: Mapping[str, Any]) -> SweptTask:
     n_objects, unguided = rows[0]["n_objects"], rows[0]["seconds_unguided"]
     runs = {n_objects: Run(kept=n_objects, solved=True, seconds=unguided)}
-    runs |= {
-        row["n_kept"]: Run(
-            kept=row["n_kept"],
-            solved=row["solved_guided"],
-            seconds=max(row["seconds_guided"] - row["seconds_inference"], 0.0),
-        )
-        for row in rows
-    }
+    for kept in {row["n_kept"] for row in rows}:
+        mine = [row for row in rows if row["n_kept"] == kept]
+        seconds = median(row["seconds_guided"] - row["seconds_inference"] for row in mine)
+        runs[kept] = Run(kept=kept, solved=mine[0]["solved_guided"], seconds=max(seconds, 0.0))
     queries = list(zip(scored["scores"], scored["relevant"], strict=True))
     return SweptTask(
         n_objects=n_objects,
         unguided=unguided,
-        network=min(row["seconds_inference"] for row in rows),
+        network=median(row["seconds_inference"] for row in rows),
         runs=tuple(runs[kept] for kept in sorted(runs)),
         scores=tuple(score for score, _ in queries),
         relevant=tuple(score for score, is_relevant in queries if is_relevant),

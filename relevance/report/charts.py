@@ -27,6 +27,13 @@ def _percent(axis: Any) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{round(100 * value, 2):g}%"))
 
 
+def _legend_below(ax: Axes) -> None:
+    """One legend under all panels, in a row."""
+    handles, labels = ax.get_legend_handles_labels()
+    given = {"loc": "outside lower center", "ncols": 4, "columnspacing": 1.0, "handletextpad": 0.3}
+    ax.figure.legend(handles, labels, **given)
+
+
 def visibility(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     """Objects by how much of them shows, in tenths: a bar a family."""
     families = [group for group in GROUPS if any(row["family"] == group for row in rows)]
@@ -82,13 +89,12 @@ def by_part(ax: Axes, rows: Sequence[Mapping[str, Any]], by: str, title: str) ->
         base = [row["base_rate"]] * 2
         label = None if at else "always irrelevant"
         ax.plot(base, [at - 0.4, at + 0.4], ":", color=INK, linewidth=1.2, label=label)
-    ax.set_yticks(y, [f"{row[by]}\n" + f"n = {row['objects']:,}" for row in rows], linespacing=0.95)
-    ax.tick_params("y", labelsize=8)
+    ax.set_yticks(y, [f"{row[by]} (n = {row['objects']:,})" for row in rows])
     ax.set_ylim(-0.6, len(rows) - 0.4)
     ax.set_xlim(-0.02, 1.02)
     ax.grid(axis="y", visible=False)
     ax.set_title(title)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.4, -0.45 / len(rows)), ncols=4)
+    _legend_below(ax)
     _percent(ax.xaxis)
 
 
@@ -110,14 +116,15 @@ def bodies(*axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
             first = "always irrelevant" if row["checkpoint_id"] == names[0] else None
             ax.plot(base, [at - 0.4, at + 0.4], ":", color=INK, linewidth=1.2, label=first)
         labels = [name if len(name) <= 20 else f"{name[:19]}…" for name in names]
-        ax.set_yticks(range(len(names) - 1, -1, -1), labels)
+        shown = labels if ax is axes[0] else [""] * len(names)
+        ax.set_yticks(range(len(names) - 1, -1, -1), shown)
         ax.set_ylim(-0.6, len(names) - 0.4)
         ax.set_xlim(-0.02, 1.02)
         ax.grid(axis="y", visible=False)
         _percent(ax.xaxis)
     for ax in axes[len(families) :]:
         ax.set_axis_off()
-    axes[0].legend(loc="upper left", bbox_to_anchor=(0, -0.35 / len(names)), ncols=4)
+    _legend_below(axes[0])
 
 
 def keeping(ax: Axes, curve: Sequence[Mapping[str, float]], now: Mapping[str, float]) -> None:
@@ -142,19 +149,16 @@ def saving(
     betas: Sequence[float],
     speedups: Sequence[float],
     beta: float,
-    reruns: Sequence[tuple[float, float]],
+    reruns: Sequence[float],
 ) -> None:
-    """The speed-up over beta, misses counted; `reruns` are (beta, speed-up) that were measured."""
+    """The speed-up over beta, misses counted; `reruns` are the betas that were measured."""
     ax.axhline(1, color=FAINT, linewidth=1.2)
-    ax.plot(betas, speedups, color=INK, label="read off the reruns")
-    if reruns:
-        x, y = zip(*reruns, strict=True)
-        ax.plot(x, y, "D", color=INK, markersize=5, label="rerun at this beta")
+    ax.plot(betas, speedups, color=INK, label="speed-up, misses counted")
+    at = np.interp(reruns, betas, speedups)
+    ax.plot(reruns, at, "D", color=INK, markersize=4.5, label="the planner was rerun here")
     ax.axvline(beta, color=MUTED, linewidth=1)
-    ax.plot(beta, np.interp(beta, betas, speedups), "o", color=INK, markersize=6)
-    ax.set_ylim(
-        bottom=0, top=max([1.1, *(1.15 * s for s in speedups), *(1.15 * s for _, s in reruns)])
-    )
+    ax.plot(beta, np.interp(beta, betas, speedups), "o", color=INK, markersize=7)
+    ax.set_ylim(0, max(1.1, 1.15 * max(speedups)))
     ax.set_xlabel("beta (larger keeps more)")
     ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}{TIMES}"))
     ax.legend(loc="lower right")
