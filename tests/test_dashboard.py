@@ -73,7 +73,7 @@ def test_every_query_runs_by_itself_in_plain_duckdb(query) -> None:
         assert by_itself == [tuple(row.values()) for row in ask(all_of(root), query)]
         for name, value in asked_by_pages(checkpoint.stem).items():
             plain.execute(f"SET VARIABLE {name} = ?", [value])
-        assert plain.execute(text).fetchall()
+        assert plain.execute(text).fetchall() or query == "failures"  # there may be none
 
 
 def asked_by_pages(checkpoint: str) -> dict[str, Any]:
