@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
@@ -66,7 +67,9 @@ def test_every_query_runs_by_itself_in_plain_duckdb(query) -> None:
     with duckdb.connect() as plain:
         plain.execute("SET VARIABLE dataset = ?", [str(root)])
         for file in ("tables.sql", "views.sql"):
-            plain.execute((ROOT / "schemas" / file).read_text())
+            for view in duckdb.extract_statements((ROOT / "schemas" / file).read_text()):
+                with suppress(duckdb.IOException):  # no files: nothing lies beside the labels
+                    plain.execute(view)
         text = (SQL / f"{query}.sql").read_text()
         assert text.startswith("-- ")
         by_itself = plain.execute(text).fetchall()
@@ -99,7 +102,7 @@ def test_every_query_is_asked_and_no_icon_is_fetched() -> None:
         assert f'"{query}"' in text
     assert "page_icon" not in text
     assert ":material" not in text
-    assert "SELECT" not in text.upper().replace("SELECTBOX", "").replace("MULTISELECT", "")
+    assert not re.search(r"\bselect\s", text, re.IGNORECASE)
     assert not (APP.parent / "pages").exists()  # Streamlit would run its files by themselves
 
 
