@@ -47,7 +47,7 @@ def visited(dataset, tmp_path_factory) -> Iterator[browsing.Visit]:
     command = browsing.relevance("dashboard", dataset, "--port", "{port}")
     nobody = {"PREFECT_API_URL": "http://127.0.0.1:9/api"}
     with browsing.running(command, log, **nobody) as url, browsing.visit() as visit:
-        visit.page.set_default_timeout(120_000)
+        visit.page.set_default_timeout(300_000)
         visit.page.goto(url)
         yield visit
 
@@ -87,6 +87,7 @@ def widget(visit: browsing.Visit, kind: str, label: str) -> Any:
 def choose(visit: browsing.Visit, kind: str, label: str, option: str) -> None:
     widget(visit, kind, label).click()
     visit.page.get_by_role("option", name=option, exact=True).click()
+    visit.page.keyboard.press("Escape")  # a list of several stays open
     settle(visit)
 
 
