@@ -1,6 +1,7 @@
 """Checkpoints: how they learned and where they err, one beside another."""
 
 from dataclasses import replace
+from typing import Any
 
 import streamlit as st
 
@@ -52,19 +53,19 @@ def predicted(choice: Choice) -> tuple[Predictions, list[str]]:
 
 
 @st.cache_data(show_spinner=False, max_entries=40)
-def judged(choice: Choice, goal_objects: bool = False) -> list[dict[str, object]]:
+def judged(choice: Choice, goal_objects: bool = False) -> list[dict[str, Any]]:
     """The network beside the rules."""
     found, _ = predicted(choice)
     return accuracy_table(found if goal_objects else found.queries(), beta=choice.beta)
 
 
 @st.cache_data(show_spinner=False, max_entries=80)
-def by_part(choice: Choice, by: str) -> list[dict[str, object]]:
+def by_part(choice: Choice, by: str) -> list[dict[str, Any]]:
     """The network by parts of the queries."""
     return breakdown_table(predicted(choice)[0].queries(), by, beta=choice.beta)
 
 
-def show(choice: Choice, row: dict[str, object], *, columns: int) -> None:
+def show(choice: Choice, row: dict[str, Any], *, columns: int) -> None:
     """One checkpoint, its plots in that many columns."""
     name = str(choice.checkpoint)
     st.subheader(name, anchor=False)

@@ -2,6 +2,7 @@
 
 import shlex
 from html import escape
+from typing import Any
 
 import streamlit as st
 
@@ -76,7 +77,7 @@ found = rows[0]["found"]
 (task, sample), *others = tasks_with_answers(choice, rows)
 
 back, which, on, _ = st.columns([1, 2, 1, 6], vertical_alignment="bottom")
-turn = {"on_click": place, "width": "stretch"}
+turn: dict[str, Any] = {"on_click": place, "width": "stretch"}
 back.button("Back", key="back", disabled=number <= 1, args=[number - 1], **turn)
 st.session_state["pick_place"] = number
 which.number_input(f"Goal, of {found:,}", 1, found, key="pick_place")

@@ -30,8 +30,8 @@ def _percent(axis: Any) -> None:
 def _legend_below(ax: Axes) -> None:
     """One legend under all panels, in a row."""
     handles, labels = ax.get_legend_handles_labels()
-    given = {"loc": "outside lower center", "ncols": 4, "columnspacing": 1.0, "handletextpad": 0.3}
-    ax.figure.legend(handles, labels, **given)
+    room: dict[str, Any] = {"columnspacing": 1.0, "handletextpad": 0.3}
+    ax.figure.legend(handles, labels, loc="outside lower center", ncols=4, **room)
 
 
 def visibility(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
