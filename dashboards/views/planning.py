@@ -73,7 +73,7 @@ def reruns(
     scored = ask(choice, "task_scores", checkpoint_id=checkpoint, split=split)
     measured: dict[str, list[float]] = {}
     for search, guide, beta in settings(rows):
-        if guide == "prune":
+        if guide == "prune" and BETAS[0] <= beta <= BETAS[-1]:
             measured.setdefault(search, []).append(beta)
     return swept(rows, scored), measured
 
@@ -128,7 +128,7 @@ def working(choice: Choice) -> None:
                 betas=BETAS,
                 speedups=saved(tasks[searches[0]], BETAS),
                 beta=choice.beta,
-                reruns=measured[searches[0]],
+                reruns=measured.get(searches[0], []),
                 size=(4.8, 3.0),
             )
     st.caption(
