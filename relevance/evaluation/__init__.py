@@ -61,6 +61,7 @@ from relevance.evaluation.scorer import (
 from relevance.evaluation.scores import scores
 from relevance.evaluation.suites import SUITES, Suite, away, suite_of
 from relevance.evaluation.tuning import Patience, Tuned, TuningConfig, is_tuned, tune
+from relevance.evaluation.working_points import SweptTask, WorkingPoint, saved, swept, working_point
 
 __all__ = [
     "BREAKDOWNS",
@@ -89,12 +90,14 @@ __all__ = [
     "Promise",
     "Seen",
     "Suite",
+    "SweptTask",
     "Task",
     "Timed",
     "Trial",
     "TrialConfig",
     "Tuned",
     "TuningConfig",
+    "WorkingPoint",
     "accuracy_table",
     "amortised_costs",
     "away",
@@ -125,6 +128,7 @@ __all__ = [
     "read_evaluations",
     "read_predictions",
     "rerun_priors",
+    "saved",
     "scores",
     "settings",
     "shown_as",
@@ -132,7 +136,9 @@ __all__ = [
     "speed_table",
     "suite_of",
     "summarise",
+    "swept",
     "tune",
     "unjudged",
     "with_oracle",
+    "working_point",
 ]

@@ -158,8 +158,8 @@ def covered_speeds(
 ) -> dict[float, list[Comparison]]:
     """The planner rerun at every coverage: a comparison a search and guide, all tasks together.
 
-    Of the settings, `beta`, `betas` and `priors` have no part in it. Tasks of a predicate for which a
-    coverage cannot be had are left out of it.
+    Of the settings, `beta`, `betas` and `priors` have no part in it. Tasks of a predicate for which
+    a coverage cannot be had are left out of it.
     """
     config = replace(config or EvaluationConfig.demo(), beta=0.0, betas=(), priors=())
     dataset = Dataset.open(root)

@@ -92,7 +92,7 @@ def penetration(scene: Scene, result: PlanResult) -> float:
         margin, over = np.zeros((len(body.link), there.sum())), np.zeros((len(phase.q) - 1, 2))
         depth = dense_check(phase.q, problem.arm, body, obstacles[there], margin, over)
         worst = max(worst, depth, upper_depth(problem, phase.q, obstacles[there][:-2]))
-        if holding:
+        if holding and held is not None:
             worst = max(worst, shoulder_depth(problem, phase.q, phase.opening, held))
     return worst
 

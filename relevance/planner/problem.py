@@ -111,9 +111,10 @@ class Problem:
 
     def _of_robot(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
         """A box of the base's frame as an obstacle."""
-        row, (x, y, z), (bx, by, bz, yaw) = np.empty(UPRIGHT), centre, self.arm.base
+        row, (bx, by, bz, yaw) = np.empty(UPRIGHT), self.arm.base
+        (x, y, z), (hx, hy, hz) = centre, half
         c, s = math.cos(yaw), math.sin(yaw)
-        upright(bx + c * x - s * y, by + s * x + c * y, bz + z, yaw, *half, row)
+        upright(bx + c * x - s * y, by + s * x + c * y, bz + z, yaw, hx, hy, hz, row)
         return row
 
     def standing(self, gone: Collection[str]) -> np.ndarray:

@@ -87,6 +87,11 @@ def network_section(
     return model
 
 
+def training_history(dataset: Dataset, chosen: Mapping[str, Any] | None) -> list[dict[str, float]]:
+    """The training curve that a checkpoint's file holds; empty without the file."""
+    return _meta(dataset, chosen).get("history", [])
+
+
 def _meta(dataset: Dataset, chosen: Mapping[str, Any] | None) -> dict[str, Any]:
     """What the checkpoint's file says of it (curve, calibration); nothing without the file."""
     if chosen is None:

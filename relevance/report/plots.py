@@ -11,7 +11,7 @@ import re
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
@@ -20,7 +20,6 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from relevance.evaluation import LEVELS, Comparison, Covered, Predictions, guided_cost
 from relevance.metrics import mean_interval
 from relevance.report.paper import paper
 from relevance.report.style import (
@@ -42,6 +41,9 @@ from relevance.report.style import (
     seconds,
 )
 from relevance.report.style import groups as shown_groups
+
+if TYPE_CHECKING:  # the planner comes with it, of which most plots know nothing
+    from relevance.evaluation import Comparison, Covered, Predictions
 
 QUANTILES = np.linspace(0, 1, 201)
 """Shares at which distributions of times are drawn; the middle one is the median."""
@@ -211,6 +213,8 @@ def beta_accuracy(*axes: Axes, predictions: Predictions) -> None:
 
 def coverage(*axes: Axes, rows: Sequence[Covered]) -> None:
     """What was promised against what was reached, and against how much is kept for it."""
+    from relevance.evaluation import LEVELS
+
     reached_ax, kept_ax = axes
     for number, group in enumerate(dict.fromkeys(row.group for row in rows)):
         found, color = [row for row in rows if row.group == group], family_color(group)
@@ -284,6 +288,8 @@ def runtimes(*axes: Axes, comparisons: dict[str, list[Comparison]]) -> None:
 
 def by_objects(ax: Axes, rows: dict[str, list[dict[str, Any]]]) -> None:
     """Mean CPU time by the number of objects, with intervals; `rows` per guide, solvable tasks."""
+    from relevance.evaluation import guided_cost
+
     first = next(iter(rows.values()))
     series = {UNGUIDED: (first, lambda row: row["seconds_unguided"])}
     series |= {guide: (chosen, guided_cost) for guide, chosen in rows.items()}
