@@ -370,6 +370,7 @@ def _generate(root: Path, home: Path) -> subprocess.Popen[bytes]:
     )
 
 
+@pytest.mark.slow  # two servers and two runs, one of them killed
 def test_a_killed_flow_leaves_nobody_behind_and_resumes_to_the_same_bytes(
     home: Path, tmp_path: Path
 ) -> None:

@@ -13,7 +13,16 @@ from evaluated import evaluated
 
 from relevance.cli import main
 from relevance.errors import RelevanceError, RelevanceWarning
-from relevance.evaluation import SUITES, EvaluationConfig, away, evaluate, predict, suite_of
+from relevance.evaluation import (
+    SUITES,
+    EvaluationConfig,
+    away,
+    checkpoint_id,
+    evaluate,
+    predict,
+    read_evaluations,
+    suite_of,
+)
 from relevance.pipeline.settings import settings_of_family
 from relevance.planner import GUIDES
 from relevance.sampling import SceneConfig, sample_scene
@@ -116,7 +125,7 @@ def test_a_checkpoint_from_elsewhere_is_judged_and_complete_guides_lose_nothing(
     [before] = away([root], checkpoint)
     assert (before["goals"], before["set_recall"], before["solved"]) == (0, None, None)
     complete = tuple(name for name, mode in GUIDES.items() if mode.guided and mode.complete)
-    config = EvaluationConfig(tasks=1, betas=(), guides=complete)
+    config = EvaluationConfig(tasks=1, betas=(), guides=complete, priors=())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RelevanceWarning)
         predict(root, checkpoint)
@@ -135,14 +144,12 @@ def test_a_complete_guide_that_lost_a_task_would_show(
 ) -> None:
     from relevance.evaluation import suites
 
-    base = {"solved_unguided": True, "seconds_unguided": 1.0, "seconds_guided": 1.0}
-    base |= {"predicate": "on", "family": "on", "guide": "order", "search": "tree", "beta": 0.0}
-    base |= dict.fromkeys(("seconds_inference", "nodes_unguided", "nodes_guided"), 0.0)
-    base |= dict.fromkeys(("nlps_unguided", "nlps_guided", "n_kept"), 1)
-    base |= dict.fromkeys(("n_actions_unguided", "n_actions_guided", "n_objects"), 2)
+    root, checkpoint = evaluated()
+    base = read_evaluations(Dataset.open(root), checkpoint_id(checkpoint))[0]
+    base |= {"guide": "order", "solved_unguided": True}
     rows = [base | {"solved_guided": True}, base | {"solved_guided": False}]
     monkeypatch.setattr(suites, "read_evaluations", lambda *_: rows)
-    found = suites._reruns(Dataset.open(evaluated()[0]), "")
+    found = suites._reruns(Dataset.open(root), "")
     assert (found["solved"], found["solved_guided"]) == (1.0, 0.5)
 
 
