@@ -13,8 +13,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import redirect_stdout
-from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -84,15 +83,10 @@ class Viewer:
         self._add_controls()
         self.show(0.0)
 
-    def __enter__(self) -> Viewer:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._server.stop()
 
     @property

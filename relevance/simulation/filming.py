@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from types import TracebackType
 
 import numpy as np
 
 from relevance.robot import panda_urdf
-from relevance.scene import Camera, Scene, camera_up
-from relevance.simulation.bullet import pybullet
+from relevance.scene import Camera, Scene
+from relevance.simulation.bullet import Client, lens, pybullet
 
 _JOINTS = (*range(7), 9, 10)
 _SUN = (0.5, -0.9, 2.0)
@@ -40,13 +39,11 @@ def film_camera(scene: Scene, width: int, height: int) -> Camera:
     )
 
 
-class Film:
+class Film(Client):
     """Draws a scene and its robot as they are at one moment; use as a context manager."""
 
     def __init__(self, scene: Scene, camera: Camera) -> None:
-        self._client = pybullet.connect(pybullet.DIRECT)
-        if self._client < 0:
-            raise RuntimeError("pybullet gave no client: too many are open in this process")
+        super().__init__()
         self.camera = camera
         half = scene.robot.yaw / 2
         self._robot = pybullet.loadURDF(
@@ -54,22 +51,11 @@ class Film:
             scene.robot.base,
             (0.0, 0.0, math.sin(half), math.cos(half)),
             useFixedBase=True,
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
         place = (0.0, 0.0, -_THICKNESS / 2)
         self._body((*scene.table.size, _THICKNESS), scene.table.color, place)
         self._boxes = {box.name: self._body(box.size, box.color) for box in scene.objects}
-
-    def __enter__(self) -> Film:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        pybullet.disconnect(physicsClientId=self._client)
 
     def _body(
         self,
@@ -82,13 +68,13 @@ class Film:
             halfExtents=[edge / 2 for edge in size],
             rgbaColor=[*color, 1.0],
             specularColor=[0.0, 0.0, 0.0],
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
         return pybullet.createMultiBody(
             baseMass=0.0,
             baseVisualShapeIndex=shape,
             basePosition=position,
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
 
     def frame(
@@ -99,24 +85,17 @@ class Film:
         joints (7,) rad, gripper: each finger joint, m; poses: T_world_box (4, 4) of every box.
         """
         values = [[value] for value in (*joints.tolist(), gripper, gripper)]
-        pybullet.resetJointStatesMultiDof(
-            self._robot, _JOINTS, values, physicsClientId=self._client
-        )
+        pybullet.resetJointStatesMultiDof(self._robot, _JOINTS, values, physicsClientId=self.client)
         for name, T in poses.items():
             pybullet.resetBasePositionAndOrientation(
-                self._boxes[name], T[:3, 3], _quaternion(T), physicsClientId=self._client
+                self._boxes[name], T[:3, 3], _quaternion(T), physicsClientId=self.client
             )
         camera = self.camera
         width, height = _FINE * camera.width, _FINE * camera.height
-        aspect = width / height
-        vertical = 2 * math.atan(math.tan(math.radians(camera.fov) / 2) / aspect)
         _, _, rgba, _, bodies = pybullet.getCameraImage(
             width,
             height,
-            pybullet.computeViewMatrix(camera.eye, camera.target, camera_up(camera)),
-            pybullet.computeProjectionMatrixFOV(
-                math.degrees(vertical), aspect, camera.near, camera.far
-            ),
+            *lens(camera),
             lightDirection=_SUN,
             lightColor=(1.0, 1.0, 1.0),
             lightDistance=3.0,
@@ -125,7 +104,7 @@ class Film:
             lightDiffuseCoeff=0.4,
             lightSpecularCoeff=0.05,
             renderer=pybullet.ER_TINY_RENDERER,
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
         fine = np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)[..., :3].copy()
         ids = np.asarray(bodies).reshape(height, width)
