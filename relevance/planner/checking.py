@@ -37,12 +37,12 @@ def broken(problem: Problem, motion: Motion) -> str:
             return f"phase {number}: a joint moves at {speed:.2f} times its speed limit"
     if motion.max_penetration > ALLOWED:
         return f"something is penetrated by {1000 * motion.max_penetration:.1f} mm"
-    for name, pose in motion.final.items():
-        box = at_last(problem.boxes[name], pose)
-        if pose.on is None and (abs(box.corners()) > problem.table + CONTACT_TOLERANCE).any():
+    moved = {name: at_last(problem.boxes[name], pose) for name, pose in motion.final.items()}
+    for name, box in moved.items():
+        if box.on is None and (abs(box.corners()) > problem.table + CONTACT_TOLERANCE).any():
             return f"{name} is not put on the table"
     ends = {problem.goal.subject, problem.goal.reference}
-    boxes = [at_last(problem.boxes[name], motion.final.get(name)) for name in ends]
+    boxes = [moved.get(name, problem.boxes[name]) for name in ends]
     if not goal_holds(boxes, problem.goal, problem.scene.robot):
         return f"the goal {problem.goal} is not true at the end"
     return ""
@@ -63,10 +63,8 @@ def extremes(q, dt, lower, upper, velocity):
     return joint, over, speed
 
 
-def at_last(box: Box, pose: Pose | None) -> Box:
+def at_last(box: Box, pose: Pose) -> Box:
     """The box where a plan leaves it."""
-    if pose is None:
-        return box
     return replace(box, position=pose.position, yaw=pose.yaw, on=pose.on)
 
 
