@@ -1,5 +1,6 @@
 # make demo    install, run the whole pipeline on a small dataset, say where the report is
 # make test    install with the test tools, run the default tests
+# make test-browser  install with playwright, open every page in Chromium
 # make check   formatting, lint, types, and the order of imports
 # make drawing write the drawing of the rooms and the map of the files into CONTRIBUTING.md
 # make deploy  register the flows with a running Prefect server
@@ -17,7 +18,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # --no-compile: byte code is made when a module is first used, which saves a minute here.
 COMPILE := $(BIN)/python -c "import relevance.planner; relevance.planner.warm_up()"
 
-.PHONY: demo test test-slow check format drawing deploy clean
+.PHONY: demo test test-slow test-browser check format drawing deploy clean
 .DELETE_ON_ERROR:
 
 # What the demo tells Prefect stays in this folder. Killed or done, it may be run again: finished
@@ -32,6 +33,10 @@ test: .venv/installed-dev
 
 test-slow: .venv/installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow --durations 10 $(TESTS)
+
+# Chromium is the system's (apt-get install chromium); what it saw is in build/screenshots.
+test-browser: .venv/installed-browser
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m browser --durations 10 tests/test_browser.py tests/test_view_browser.py
 
 check: .venv/installed-dev
 	$(BIN)/ruff check .
@@ -67,6 +72,10 @@ deploy: .venv/installed
 .venv/installed-dev: pyproject.toml | .venv/bin/python
 	$(PIP) install --no-compile -e ".[dev]"
 	touch .venv/installed $@
+
+.venv/installed-browser: .venv/installed-dev
+	$(PIP) install --no-compile -e ".[browser]"
+	touch $@
 
 clean:
 	rm -rf .venv .prefect .pytest_cache .ruff_cache .hypothesis build dist

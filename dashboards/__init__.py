@@ -1,1 +1,1 @@
-"""The dashboard (`app.py`, a Streamlit script) and its SQL."""
+"""The dashboard (`app.py`, a Streamlit script), its pages (`views`) and its SQL."""

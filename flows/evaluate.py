@@ -52,7 +52,7 @@ def evaluate(
 
     Args:
         dataset: Folder of a labelled dataset.
-        checkpoint: Path of the checkpoint; the dataset's newest when empty.
+        checkpoint: Path of the checkpoint; the dataset's champion when empty, or its newest.
         preset: How much is rerun: smoke, demo, laptop or paper.
         overrides: Settings that differ from the preset, e.g. {"tasks": 100}; keys may be dotted.
         max_workers: Processes that work at a time; the number of cores when empty. Times are of

@@ -1,4 +1,4 @@
-"""Flow `train`: a relevance model from a dataset's shards."""
+"""Flow `train`: a relevance model from a dataset's shards, ready to guide."""
 
 from __future__ import annotations
 
@@ -27,6 +27,16 @@ def train_model(root: str, config: TrainConfig, out: str | None) -> str:
     return str(path)
 
 
+@retried(name="tune-guide")
+def tune_guide(root: str, checkpoint: str) -> None:
+    """Choose when a lazy guide looks, where nobody did and there are tasks to choose on."""
+    from relevance import evaluation
+    from relevance.store import Dataset
+
+    if Dataset.open(root).shards("validation") and not evaluation.is_tuned(checkpoint):
+        evaluation.tune(root, checkpoint)
+
+
 @stage()
 def train(
     dataset: DatasetPath = "data/demo",
@@ -34,7 +44,8 @@ def train(
     overrides: Overrides | None = None,
     out: str | None = None,
 ) -> str:
-    """Train a model on a labelled dataset; returns the path of its checkpoint.
+    """Train a model on a labelled dataset and choose when a lazy guide asks it; returns the path of
+    its checkpoint.
 
     The same settings on the same data give the same checkpoint, so nothing is trained twice.
 
@@ -51,6 +62,7 @@ def train(
     there = Dataset.open(root)
     config = configured(TrainConfig, preset, overrides)
     path = Path(train_model(str(root), config, str(absolute(out)) if out else None))
+    tune_guide(str(root), str(path))
     [row] = [r for r in there.read_rows("checkpoints") if r["checkpoint_id"] == path.stem]
     metrics = json.loads(row["metrics"])
     leave_table("train-metrics", table(metrics), f"Validation metrics of `{row['checkpoint_id']}`")

@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from relevance.errors import RelevanceError, RelevanceWarning
-    from relevance.evaluation import load_guide
+    from relevance.evaluation import Seen, load_guide, look_at, scores
     from relevance.planner import Guide, PlannerConfig, PlanResult, plan, trajectory
     from relevance.scene import Goal, Scene, SceneError, read_scenes
+    from relevance.simulation import World, read_bullet, write_bullet
     from relevance.store import Dataset
 
 # torch's threads spin while they wait unless told so before torch loads; on a shared machine
@@ -77,10 +78,16 @@ _HOMES = {
     "RelevanceWarning": "relevance.errors",
     "Scene": "relevance.scene",
     "SceneError": "relevance.scene",
+    "Seen": "relevance.evaluation",
+    "World": "relevance.simulation",
     "load_guide": "relevance.evaluation",
+    "look_at": "relevance.evaluation",
     "plan": "relevance.planner",
+    "read_bullet": "relevance.simulation",
     "read_scenes": "relevance.scene",
+    "scores": "relevance.evaluation",
     "trajectory": "relevance.planner",
+    "write_bullet": "relevance.simulation",
 }
 
 __all__ = [
@@ -93,10 +100,16 @@ __all__ = [
     "RelevanceWarning",
     "Scene",
     "SceneError",
+    "Seen",
+    "World",
     "load_guide",
+    "look_at",
     "plan",
+    "read_bullet",
     "read_scenes",
+    "scores",
     "trajectory",
+    "write_bullet",
 ]
 
 

@@ -62,6 +62,8 @@ class Panda:
     """The same for UPPER_LINKS."""
     foot: tuple[np.ndarray, np.ndarray]
     """Box (centre, half extents) around the link that does not move, in the base's frame."""
+    shoulder: tuple[np.ndarray, np.ndarray]
+    """The same around the first link, where joint 1, which turns it about the vertical, is at 0."""
     finger: tuple[tuple[np.ndarray, np.ndarray], ...]
     """Boxes (low corner, high corner) of the left finger at opening 0, in the hand's frame."""
     finger_tip: float
@@ -124,6 +126,7 @@ def panda() -> Panda:
             for i, name in enumerate(UPPER_LINKS)
         ),
         foot=_box(_vertices(meshes / "link0.obj")),
+        shoulder=_box(_vertices(meshes / "link1.obj") + chain[0].origin[:3, 3]),
         finger=(_slice(finger, middle, np.inf), _slice(finger, -np.inf, middle)),
         finger_tip=float(finger[:, 2].max()),
         palm=float(hand[:, 2].max()),

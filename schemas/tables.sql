@@ -28,7 +28,8 @@ CREATE OR REPLACE VIEW evaluations AS
 FROM read_parquet(
     getvariable('dataset') || '/evaluations/checkpoint_id=*/split=*/*.parquet',
     hive_partitioning = false, union_by_name = true
-);
+)
+UNION ALL BY NAME SELECT NULL::VARCHAR AS "prior", NULL::VARCHAR AS "suite", NULL::VARCHAR AS "stop", NULL::BOOLEAN AS "looked", NULL::BIGINT AS "sequences", NULL::BIGINT AS "sequences_unguided", NULL::DOUBLE AS "seconds_encoding" WHERE false;
 
 CREATE OR REPLACE VIEW labels AS
 FROM read_parquet(

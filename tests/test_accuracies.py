@@ -54,6 +54,7 @@ def predictions(**columns: list) -> Predictions:
     constant = {
         "predicate": "on",
         "family": "on",
+        "scene": 0,
         "task": 0,
         "is_goal_object": False,
         "is_subject": False,

@@ -7,12 +7,14 @@ import io
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from relevance.cli import COMMANDS, main
 from relevance.cli.terminal import show, to_json
+from relevance.networks import named, read_checkpoint, write_checkpoint
 
 ROOT = Path(__file__).parent.parent
 RELEVANCE = Path(sys.executable).parent / "relevance"
@@ -162,7 +164,7 @@ def test_plan_prints_one_json_line_a_goal(tmp_path: Path) -> None:
     for line in lines:
         assert set(line) == {
             *("id", "goal", "status", "reason", "actions", "moved", "final"),
-            *("blocking", "cost", "ambiguous", "seconds", "counts", "replay"),
+            *("blocking", "cost", "ambiguous", "seconds", "counts", "looked", "replay"),
         }
         assert set(line["counts"]) == {"nodes", "pose", "keyframe", "path"}
         assert (line["id"], line["status"]) == ("s1", "solved")
@@ -176,6 +178,20 @@ def test_plan_prints_one_json_line_a_goal(tmp_path: Path) -> None:
     assert first["moved"] == ["blue"]
     assert first["final"]["blue"]["position"][1] > 0.11  # left of red
     assert lines[1]["actions"][-1] == ["place", "red", "blue"]
+
+
+def test_a_lazy_guide_looks_when_its_checkpoint_says(tmp_path: Path) -> None:
+    plain = _plan(tmp_path)
+    assert not any(line["looked"] for line in plain)
+    shipped = read_checkpoint(named("geometry"))
+    for patience, looked in ((0, True), (10**9, False)):
+        file = tmp_path / f"{patience}.pt"
+        write_checkpoint(file, replace(shipped, meta=shipped.meta | {"patience": patience}))
+        lines = _plan(tmp_path, "--guide", "lazy", "--checkpoint", str(file))
+        assert [line["looked"] for line in lines] == [looked] * len(plain)
+        for mine, line in zip(plain, lines, strict=True):
+            assert (line["status"], line["moved"]) == (mine["status"], mine["moved"])
+            assert line["replay"]["ok"]
 
 
 def test_an_infeasible_goal_is_a_result_with_a_reason(tmp_path: Path) -> None:

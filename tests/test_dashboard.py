@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
+import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
+from typing import Any
 
+import duckdb
 import pytest
 from evaluated import DATA, evaluated, labelled
 from streamlit.testing.v1 import AppTest
 
-from relevance.evaluation import (
-    BREAKDOWNS,
-    read_evaluations,
-    read_predictions,
-    settings,
-    summarise,
-)
+from dashboards.asking import SQL, Choice, ask, version_of
+from relevance.evaluation import read_evaluations, read_predictions, settings, summarise
 from relevance.pipeline import describe
-from relevance.report.style import TIMES
+from relevance.report.style import TIMES, percent
 from relevance.store import Dataset
 
-APP = Path(__file__).parent.parent / "dashboards" / "app.py"
+ROOT = Path(__file__).parent.parent
+APP = ROOT / "dashboards" / "app.py"
+PAGES = ("data", "scenes", "models", "planning", "runs")
+QUERIES = sorted(file.stem for file in SQL.glob("*.sql"))
 
 
 @pytest.fixture
@@ -29,11 +36,12 @@ def page(monkeypatch):
     """Runs a page on a dataset folder."""
     # Streamlit leaves the page as the main module; processes spawned later would run it.
     monkeypatch.setitem(sys.modules, "__main__", sys.modules["__main__"])
+    monkeypatch.setenv("PREFECT_API_URL", "http://127.0.0.1:9/api")  # nobody is there
 
-    def run(dataset: Path, name: str = "labels") -> AppTest:
+    def run(dataset: Path, name: str = "data") -> AppTest:
         monkeypatch.setattr("sys.argv", ["app.py", str(dataset)])
-        app = AppTest.from_file(str(APP), default_timeout=60).run()
-        return app if name == "labels" else app.switch_page(f"views/{name}.py").run()
+        app = AppTest.from_file(str(APP), default_timeout=120).run()
+        return app if name == "data" else app.switch_page(f"views/{name}.py").run()
 
     return run
 
@@ -43,33 +51,144 @@ def values(app: AppTest) -> dict[str, str]:
     return {metric.label: metric.value for metric in app.metric}
 
 
-def test_figures_are_those_of_the_rows(page) -> None:
-    root, checkpoint = evaluated()
+def all_of(root: Path) -> Choice:
+    """The whole of a dataset, with the labels of its own policy."""
     dataset = Dataset.open(root)
-    shown = values(page(root, "accuracy"))
-    assert shown["Scenes"] == str(len(dataset.read_rows("scenes")))
-    found = read_predictions(dataset, checkpoint.stem).queries()
-    for group in ("same-plane", "on"):
-        accuracy = found.of(group).accuracy()
-        assert shown[f"Total, {group}"] == f"{100 * accuracy.total:.1f}%"
-    frames = [frame.value for frame in page(root, "accuracy").dataframe]
-    assert len(frames) == 2 + len(BREAKDOWNS)
-    for frame, by in zip(frames[1:-1], BREAKDOWNS, strict=True):
-        assert frame["objects"].sum() == len(found)
-        assert frame[by].is_unique or by != "predicate"
-    rows = settings(read_evaluations(dataset, checkpoint.stem))["tree", "prune-then-full", 0.0]
-    expected = summarise(rows).speedup.value
-    shown = values(page(root, "speed"))
-    assert shown["prune-then-full, tree search"] == f"{expected:.2f}{TIMES}"
+    policy = dataset.labelling.policy if dataset.labelling else None
+    return Choice(path=str(root), version=version_of(str(root)), own_policy=policy, policy=policy)
 
 
-def test_table_and_report_agree_on_the_speed_up(page) -> None:
+# --- queries ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("query", QUERIES)
+def test_every_query_runs_by_itself_in_plain_duckdb(query) -> None:
     root, checkpoint = evaluated()
-    app = page(root, "speed")
-    table = next(f.value for f in app.dataframe if "speedup" in f.value.columns)
-    for (search, guide, beta), rows in settings(
-        read_evaluations(Dataset.open(root), checkpoint.stem)
-    ).items():
+    with duckdb.connect() as plain:
+        plain.execute("SET VARIABLE dataset = ?", [str(root)])
+        for file in ("tables.sql", "views.sql"):
+            for view in duckdb.extract_statements((ROOT / "schemas" / file).read_text()):
+                with suppress(duckdb.IOException):  # no files: nothing lies beside the labels
+                    plain.execute(view)
+        text = (SQL / f"{query}.sql").read_text()
+        assert text.startswith("-- ")
+        by_itself = plain.execute(text).fetchall()
+        assert by_itself == [tuple(row.values()) for row in ask(all_of(root), query)]
+        for name, value in asked_by_pages(checkpoint.stem).items():
+            plain.execute(f"SET VARIABLE {name} = ?", [value])
+        assert plain.execute(text).fetchall() or query == "failures"  # there may be none
+
+
+def asked_by_pages(checkpoint: str) -> dict[str, Any]:
+    """Variables under which every query finds something."""
+    plans = Dataset.open(evaluated()[0]).read_rows("plans", split="test")
+    return {
+        "splits": ["test"],
+        "split": "test",
+        "statuses": None,
+        "checkpoint_id": checkpoint,
+        "beta": -50.0,
+        "coverage": 0.5,
+        "plan_ids": [row["plan_id"] for row in plans],
+        "scene_ids": [row["scene_id"] for row in plans],
+        "shards": sorted({row["shard"] for row in plans}),
+    }
+
+
+def test_every_query_is_asked_and_no_icon_is_fetched() -> None:
+    files = [*APP.parent.rglob("*.py")]
+    text = "".join(file.read_text() for file in files)
+    for query in QUERIES:
+        assert f'"{query}"' in text
+    assert "page_icon" not in text
+    assert ":material" not in text
+    assert not re.search(r"\bselect\s", text, re.IGNORECASE)
+    assert not (APP.parent / "pages").exists()  # Streamlit would run its files by themselves
+
+
+def test_a_changed_file_is_read_again(tmp_path) -> None:
+    root = tmp_path / "changed"
+    shutil.copytree(labelled(), root)
+    choice = all_of(root)
+    before = ask(choice, "goal_totals")[0]["goals"]
+    dataset = choice.dataset
+    file = dataset.files("plans")[0]
+    rows = dataset.read_file(file).to_pylist()
+    keys = {key: rows[0][key] for key in ("split", "shard", "predicate")}
+    dataset.write_rows("plans", rows[1:], **keys, made_by={"config": "c", "planner": "p"})
+    assert choice.dataset.metadata(file)["config"] == "c"
+    assert ask(all_of(root), "goal_totals")[0]["goals"] == before - 1
+
+
+def test_the_first_figure_waits_for_nothing_heavy() -> None:
+    script = "import sys, dashboards.asking, dashboards.showing; print(*sys.modules)"
+    done = [sys.executable, "-c", script]
+    loaded = subprocess.run(done, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    heavy = {"matplotlib", "numba", "casadi", "torch", "onnxruntime", "prefect", "pybullet"}
+    assert not heavy & {*loaded.split()}
+
+
+# --- pages ------------------------------------------------------------------------------------
+
+
+def test_data_counts_what_is_chosen(page) -> None:
+    root, _ = evaluated()
+    dataset = Dataset.open(root)
+    app = page(root)
+    assert values(app)["Scenes"] == str(len(dataset.read_rows("scenes")))
+    plans = dataset.read_rows("plans")
+    solved = sum(row["status"] == "solved" for row in plans) / len(plans)
+    assert values(app)["Goals solved"] == percent(solved)
+    app.button_group(key="only_splits").set_value(["test"]).run()
+    assert values(app)["Scenes"] == str(len(dataset.read_rows("scenes", split="test")))
+    app.button_group(key="only_splits").set_value([]).run()
+    assert not app.exception
+    assert not app.metric
+    assert app.info
+
+
+def test_accuracies_are_those_of_the_rows(page) -> None:
+    root, checkpoint = evaluated()
+    found = read_predictions(Dataset.open(root), checkpoint.stem).queries()
+    app = page(root, "models")
+    shown = values(app)
+    for group in ("same-plane", "on"):
+        assert shown[f"Judged rightly, {group}"] == percent(found.of(group).accuracy().total)
+    parts = [frame.value for frame in app.dataframe if "part" in frame.value.columns]
+    assert len(parts) == 5
+    assert all(frame["objects"].sum() == len(found) for frame in parts)
+
+
+def test_beta_moves_what_is_kept_on_every_page(page) -> None:
+    root, checkpoint = evaluated()
+    found = read_predictions(Dataset.open(root), checkpoint.stem).queries()
+    app = page(root, "models")
+    for beta, expected in ((8.0, "100.0%"), (-8.0, "0.0%")):
+        app.slider(key="pick_beta").set_value(beta).run()
+        assert values(app)["Relevant ones found, on"] == expected
+    app.switch_page("views/planning.py").run()
+    assert app.slider(key="pick_beta").value == -8.0  # as it was left
+    assert values(app)["Relevant queries kept"] == "0.0%"
+    app.slider(key="pick_beta").set_value(0.5).run()
+    assert values(app)["Goals kept whole"] == percent(found.accuracy(0.5).tasks_whole)
+
+
+@pytest.mark.parametrize("coverage", [60, 100])
+def test_coverage_finds_the_beta_that_covers(page, coverage) -> None:
+    app = page(evaluated()[0], "planning")
+    app.radio(key="pick_how").set_value("coverage").run()
+    app.slider(key="pick_coverage").set_value(coverage).run()
+    assert float(values(app)["Goals kept whole"].rstrip("%")) >= coverage
+
+
+def test_planning_has_the_speed_ups_of_the_reruns(page) -> None:
+    root, checkpoint = evaluated()
+    app = page(root, "planning")
+    by_setting = settings(read_evaluations(Dataset.open(root), checkpoint.stem))
+    expected = summarise(by_setting["tree", "prune-then-full", 0.0]).speedup.value
+    assert values(app)["Speed-up of prune-then-full"] == f"{expected:.2f}{TIMES}"
+    table = next(f.value for f in app.dataframe if "speed-up" in f.value.columns)
+    for (search, guide, beta), rows in by_setting.items():
         for family in ("same-plane", "on"):
             found = summarise(rows, family)
             line = table[
@@ -78,53 +197,55 @@ def test_table_and_report_agree_on_the_speed_up(page) -> None:
                 & (table.beta == beta)
                 & (table.family == family)
             ].iloc[0]
-            assert line.speedup == pytest.approx(found.speedup.value)
-            assert (line.tasks, line.missed) == (found.n_tasks, found.misses)
+            assert line["speed-up"] == pytest.approx(found.speedup.value)
+            assert (line.goals, line.missed) == (found.n_tasks, found.misses)
 
 
-def test_beta_moves_the_accuracy(page) -> None:
-    root, _ = evaluated()
-    app = page(root, "accuracy")
-    app.slider[0].set_value(8.0).run()
-    everything = values(app)
-    app.slider[0].set_value(-8.0).run()
-    nothing = values(app)
-    assert everything["True relevant, on"] == "100.0%"
-    assert nothing["True relevant, on"] == "0.0%"
-
-
-def test_the_grid_follows_split_and_predicate(page) -> None:
+def test_scenes_follow_the_filters_and_the_list(page) -> None:
     root, _ = evaluated()
     app = page(root, "scenes")
-    app.toggle(key="blocked").set_value(False).run()
-    app.multiselect(key="predicates").set_value(["behind"]).run()
-    goals = [m.value for m in app.markdown]  # and no stray text of the source
+    app.toggle(key="only_blocked").set_value(False).run()
+    app.multiselect(key="only_predicates").set_value(["behind"]).run()
     rows = Dataset.open(root).read_rows("plans", split="test", predicate="behind")
-    solved = {f"**behind({r['subject']}, {r['reference']})**" for r in rows if r["moved"]}
-    assert set(goals) == solved
-    app.selectbox(key="split").set_value("validation").run()
+    solved = {f"behind({row['subject']}, {row['reference']})" for row in rows if row["moved"]}
+    number = app.number_input(key="pick_place")
+    assert (number.min, number.max) == (1, len(solved))
+    seen = {app.subheader[0].value}
+    for _ in range(len(solved) - 1):
+        app.button(key="next").click().run()
+        seen.add(app.subheader[0].value)
+    assert {text.replace("\\", "") for text in seen} == solved
+    app.multiselect(key="only_predicates").set_value(["on"]).run()
     assert not app.exception
-    assert {m.value for m in app.markdown if m.value.startswith("**")} != set(goals)
+    assert app.subheader[0].value.startswith("on(")
+    assert any("relevance view" in code.value for code in app.code)
 
 
-def test_without_a_checkpoint_it_says_so(page) -> None:
-    for name, command in (("accuracy", "relevance train"), ("speed", "relevance evaluate")):
+def test_a_link_straight_to_a_page_has_the_side_bar_too(page) -> None:
+    app = page(evaluated()[0], "scenes")
+    assert {box.key for box in app.sidebar.selectbox} == {"pick_split", "pick_checkpoint"}
+
+
+# --- what is not there ------------------------------------------------------------------------
+
+
+def test_without_a_checkpoint_it_says_what_makes_one(page) -> None:
+    for name in ("models", "planning", "runs"):
         app = page(labelled(), name)
         assert not app.exception
-        assert command in " ".join(info.value for info in app.info)
-    assert any("relevant_share" in frame.value.columns for frame in page(labelled()).dataframe)
+        assert "relevance train" in " ".join(code.value for code in app.code)
+    assert page(labelled(), "scenes").number_input(key="pick_place").max > 1
 
 
 def test_a_folder_that_is_no_dataset_is_named_and_helped(page, tmp_path) -> None:
     app = page(tmp_path)
     assert not app.exception
-    assert [error.value for error in app.error] == [
-        f"{tmp_path}: no dataset.json there, expected a dataset folder"
-    ]
+    said = [error.value.replace("\\", "") for error in app.error]
+    assert said == [f"{tmp_path}: no dataset.json there, expected a dataset folder"]
     assert f"relevance generate {tmp_path}" in app.code[0].value
 
 
-@pytest.mark.parametrize("name", ["labels", "accuracy", "speed", "scenes"])
+@pytest.mark.parametrize("name", PAGES)
 def test_an_empty_or_half_made_dataset_says_what_comes_next(page, tmp_path, name) -> None:
     Dataset.create(tmp_path / "empty", describe(DATA, []))
     app = page(tmp_path / "empty", name)
@@ -135,38 +256,101 @@ def test_an_empty_or_half_made_dataset_says_what_comes_next(page, tmp_path, name
     app = page(half, name)
     assert not app.exception
     assert app.info
+    assert "relevance " in app.code[0].value
 
 
-def test_a_broken_file_gets_a_page_that_says_how_to_mend_it(page, tmp_path) -> None:
+def test_a_dataset_that_is_being_made_shows_how_far_it_is(page, tmp_path) -> None:
+    half = tmp_path / "half"
+    shutil.copytree(labelled(), half)
+    shutil.rmtree(half / "labels" / "predicate=on")
+    app = page(half)
+    assert not app.exception
+    dataset = Dataset.open(half)
+    texts = [bar.proto.text for bar in app.get("progress")]
+    assert texts[1].startswith(f"{len(dataset.files('labels'))} of ")
+    assert "relevance label" in app.code[0].value
+
+
+@pytest.mark.parametrize("what", ["plans", "dataset.json"])
+def test_a_broken_file_gets_a_page_that_says_how_to_mend_it(page, tmp_path, what) -> None:
     broken = tmp_path / "broken"
     shutil.copytree(labelled(), broken)
-    file = Dataset.open(broken).files("plans")[0]
+    found = Dataset.open(broken).files("plans")[0]
+    file = broken / what if what == "dataset.json" else found
     file.write_bytes(file.read_bytes()[:-100])
     app = page(broken)
     assert not app.exception
-    assert file.name in app.error[0].value
-    assert "relevance repair" in app.code[0].value
+    assert file.name in app.error[0].value.replace("\\", "")
+    assert "relevance repair" in app.code[-1].value
 
 
-def test_policy_of_the_labels_is_said(page) -> None:
-    root, _ = evaluated()
-    assert "Labels: policy found, which the checkpoint learned." in [
-        caption.value for caption in page(root).sidebar.caption
-    ]
+# --- Prefect ----------------------------------------------------------------------------------
+
+ANSWERS: dict[str, Any] = {
+    "/api/flows/filter": [{"id": "f1", "name": "label"}],
+    "/api/flow_runs/filter": [
+        {
+            "id": f"r{number}",
+            "name": f"run-{number}",
+            "flow_id": flow,
+            "state": {"message": "disk is full" if state == "Failed" else None},
+            "state_name": state,
+            "start_time": "2026-01-02T03:04:05Z",
+            "total_run_time": 90.0,
+            "parameters": {"dataset": "data/x"},
+        }
+        for number, (flow, state) in enumerate(
+            (("f1", "Completed"), ("f1", "Failed"), ("someone-else", "Completed"))
+        )
+    ],
+    "/api/artifacts/latest/filter": [
+        {
+            "key": "balance",
+            "type": "markdown",
+            "description": "Label balance",
+            "data": "# all well",
+            "updated": "2026-01-02T03:04:05Z",
+        }
+    ],
+}
 
 
-def test_a_link_straight_to_a_page_has_the_side_bar_too(page) -> None:
-    root, _ = evaluated()
-    assert not (APP.parent / "pages").exists()  # Streamlit would run its files by themselves
-    app = page(root, "scenes")
-    assert {box.key for box in app.sidebar.selectbox} == {"split", "checkpoint"}
+@contextmanager
+def prefect(answers: dict[str, Any]) -> Iterator[str]:
+    """Answers as Prefect's API does; its address."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            self.rfile.read(int(self.headers["Content-Length"]))
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(json.dumps(answers[self.path]).encode())
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}/api"
+        finally:
+            server.shutdown()
 
 
-def test_every_query_is_asked_and_no_icon_is_fetched() -> None:
-    files = [*APP.parent.rglob("*.py")]
-    text = "".join(file.read_text() for file in files)
-    for query in (APP.parent / "sql").glob("*.sql"):
-        assert f'"{query.stem}"' in text
-    assert "page_icon" not in text
-    assert ":material" not in text
-    assert "SELECT" not in text.upper().replace("SELECTBOX", "").replace("MULTISELECT", "")
+def test_runs_come_from_the_server(page, monkeypatch) -> None:
+    root, checkpoint = evaluated()
+    app = page(root, "runs")
+    assert "prefect server start" in app.code[-1].value
+    assert any(checkpoint.stem in text.value for text in app.markdown)
+    with prefect(ANSWERS) as url:
+        monkeypatch.setenv("PREFECT_API_URL", url)
+        app = AppTest.from_file(str(APP), default_timeout=120).run()
+        app.switch_page("views/runs.py").run()
+        shown = values(app)
+        assert (shown["Runs"], shown["Completed"], shown["Failed or crashed"]) == ("2", "1", "1")
+        table = app.dataframe[-1].value
+        assert [*table["run"]] == ["run-0", "run-1"]
+        assert [*table["said"]] == ["", "disk is full"]
+        assert any("all well" in text.value for text in app.markdown)
+        app.multiselect(key="runs_states").set_value(["Failed"]).run()
+        assert [*app.dataframe[-1].value["run"]] == ["run-1"]

@@ -17,6 +17,7 @@ from evaluated import EVALUATION, evaluated
 from relevance.configs import ConfigError
 from relevance.errors import RelevanceWarning
 from relevance.evaluation import (
+    OWN,
     EvaluationConfig,
     EvaluationError,
     NetworkScorer,
@@ -34,7 +35,7 @@ from relevance.evaluation import (
     unjudged,
 )
 from relevance.models import BODIES, RelevanceModel
-from relevance.planner import plan
+from relevance.planner import GUIDES, PlannerConfig, plan
 from relevance.report import page
 from relevance.scene import Box, Camera, Goal, Scene
 from relevance.simulation import Renderer
@@ -57,6 +58,7 @@ BLOCKED = Scene(
 )
 """`on(red, blue)` needs the lid to leave; `far` is irrelevant."""
 GOAL = Goal.parse("on(red, blue)")
+PRUNING = EvaluationConfig(guides=("prune", "prune-then-full"), priors=())
 
 
 class Given:
@@ -78,7 +80,7 @@ def test_the_blocked_task_needs_its_lid_moved() -> None:
 
 @pytest.mark.parametrize("search", ["tree", "informed"])
 def test_a_guide_that_keeps_everything_equals_no_guide(search) -> None:
-    config = EvaluationConfig(searches=(search,))
+    config = replace(PRUNING, searches=(search,))
     scorer = Given(red=1.0, blue=1.0, lid=1.0, far=1.0)
     for row in compare(BLOCKED, GOAL, scorer, config):
         assert row["solved_unguided"]
@@ -89,7 +91,7 @@ def test_a_guide_that_keeps_everything_equals_no_guide(search) -> None:
 
 
 def test_a_perfect_guide_solves_with_fewer_nodes() -> None:
-    for row in compare(BLOCKED, GOAL, Given(lid=1.0), EvaluationConfig()):
+    for row in compare(BLOCKED, GOAL, Given(lid=1.0), PRUNING):
         assert row["solved_guided"]
         assert row["n_kept"] == 3
         assert row["n_actions_guided"] == row["n_actions_unguided"] == 4
@@ -97,7 +99,7 @@ def test_a_perfect_guide_solves_with_fewer_nodes() -> None:
 
 
 def test_a_lost_blocker_is_a_miss_of_prune_and_a_fallback_of_prune_then_full() -> None:
-    prune, full = compare(BLOCKED, GOAL, Given(far=1.0), EvaluationConfig())
+    prune, full = compare(BLOCKED, GOAL, Given(far=1.0), PRUNING)
     assert (prune["guide"], full["guide"]) == ("prune", "prune-then-full")
     assert prune["solved_unguided"]
     assert not prune["solved_guided"]
@@ -109,11 +111,11 @@ def test_a_lost_blocker_is_a_miss_of_prune_and_a_fallback_of_prune_then_full() -
 
 def test_goal_objects_are_kept_whatever_their_score() -> None:
     scorer = Given(lid=1.0, red=-99.0, blue=-99.0)
-    assert all(row["solved_guided"] for row in compare(BLOCKED, GOAL, scorer, EvaluationConfig()))
+    assert all(row["solved_guided"] for row in compare(BLOCKED, GOAL, scorer, PRUNING))
 
 
 def test_beta_moves_the_threshold_and_the_sweep_reruns_the_planner() -> None:
-    config = EvaluationConfig(guides=("prune",), betas=(-3.0, 3.0))
+    config = replace(PRUNING, guides=("prune",), betas=(-3.0, 3.0))
     scorer = Given(lid=-2.0, far=-4.0)
     swept = {row["beta"]: row for row in compare(BLOCKED, GOAL, scorer, config, swept=True)}
     assert [swept[beta]["n_kept"] for beta in (-3.0, 0.0, 3.0)] == [2, 2, 3]
@@ -123,7 +125,7 @@ def test_beta_moves_the_threshold_and_the_sweep_reruns_the_planner() -> None:
 
 
 def test_only_the_first_search_is_swept() -> None:
-    config = EvaluationConfig(guides=("prune",), betas=(3.0,), searches=("tree", "informed"))
+    config = replace(PRUNING, guides=("prune",), betas=(3.0,), searches=("tree", "informed"))
     rows = compare(BLOCKED, GOAL, Given(lid=1.0), config, swept=True)
     assert [(row["search"], row["beta"]) for row in rows] == [
         ("tree", 0.0),
@@ -146,7 +148,7 @@ class Slow(NetworkScorer):
 
 
 def test_every_guided_run_pays_for_its_own_encoding() -> None:
-    config = EvaluationConfig(guides=("prune", "prune-then-full"), repeats=2)
+    config = replace(PRUNING, repeats=2)
     scorer = Slow(small_model())
     with Renderer() as renderer:
         pictures = renderer.render(BLOCKED)
@@ -169,11 +171,65 @@ def test_every_guided_run_pays_for_its_own_encoding() -> None:
         ("beta", float("nan"), "finite"),
         ("betas", (float("inf"),), "finite"),
         ("searches", ("random",), "random"),
+        ("priors", ("checkpoint",), "checkpoint is the one that is evaluated"),
+        ("priors", ("true", "true"), "distinct"),
     ],
 )
 def test_impossible_settings_are_refused_by_name(field, value, named) -> None:
     with pytest.raises(ConfigError, match=named):
         EvaluationConfig(**{field: value})
+
+
+def test_searches_stop_alike_on_both_sides() -> None:
+    config = EvaluationConfig(guides=("expand", "order"), priors=("all",))
+    rows = compare(BLOCKED, GOAL, Given(lid=1.0), config)
+    assert [(row["prior"], row["guide"], row["stop"]) for row in rows] == [
+        ("checkpoint", "expand", "level"),
+        ("checkpoint", "order", "first"),
+        ("all", "expand", "level"),
+        ("all", "order", "first"),
+    ]
+    for row in rows:
+        alone = plan(BLOCKED, GOAL, config=PlannerConfig(search="tree", stop=row["stop"]))
+        assert row["nodes_unguided"] == alone.counts.nodes
+        assert row["sequences_unguided"] == alone.counts.sequences
+
+
+class Late(Given):
+    """A scorer with a patience of its own, that counts how often it is asked."""
+
+    patience, asked = 10**9, 0
+
+    def scores(self, scene: Scene, goal: Goal) -> Mapping[str, float]:
+        self.asked += 1
+        return super().scores(scene, goal)
+
+
+def test_a_guide_that_does_not_look_pays_for_no_look() -> None:
+    scorer = Late(lid=1.0)
+    config = EvaluationConfig(guides=("lazy", "order"))
+    lazy, order, true, _ = compare(BLOCKED, GOAL, scorer, config, moved=("lid", "red"))
+    assert scorer.asked == 2  # for the row, and by `order`
+    assert (lazy["looked"], lazy["seconds_inference"]) == (False, 0.0)
+    assert order["looked"]
+    assert order["seconds_inference"] > 0
+    # the oracle's look costs nothing: it does not wait
+    assert (true["prior"], true["guide"], true["looked"]) == ("true", "lazy", True)
+    assert true["sequences"] == 1
+    assert true["n_kept"] == 3
+
+
+def test_what_a_further_goal_of_the_scene_pays_is_no_encoding() -> None:
+    scorer = Slow(small_model())
+    with Renderer() as renderer:
+        pictures = renderer.render(BLOCKED)
+    scorer.observe(BLOCKED, pictures.image, pictures.views)
+    config = EvaluationConfig(guides=("order",), priors=())
+    compare(BLOCKED, GOAL, scorer, config)  # loads compiled code
+    [row] = compare(BLOCKED, GOAL, scorer, config)
+    assert 0 < row["seconds_encoding"] <= row["seconds_inference"] < row["seconds_guided"]
+    scorer.scores(BLOCKED, GOAL)
+    assert scorer.seconds_encoding < row["seconds_encoding"]
 
 
 # --- the network as a scorer ------------------------------------------------------------------
@@ -389,7 +445,7 @@ def test_a_renamed_or_foreign_checkpoint_is_known_by_the_id_inside(tmp_path) -> 
     assert checkpoint_id(renamed) == load_scorer(renamed).checkpoint_id == checkpoint.stem
     foreign = tmp_path / "foreign.pt"
     rewritten(renamed, foreign)
-    assert evaluate(root, foreign, replace(EVALUATION, tasks=1, sweep_tasks=0)) == 10
+    assert evaluate(root, foreign, replace(EVALUATION, tasks=1, sweep_tasks=0)) == 40
     names = [row["checkpoint_id"] for row in Dataset.open(root).read_rows("checkpoints")]
     assert sorted(names) == sorted([checkpoint.stem, "glimpse-foreign"])
 
@@ -404,7 +460,7 @@ def test_rows_of_another_planner_are_left_out_and_said(tmp_path) -> None:
     old = [row | {"planner_version": "0", "seconds_unguided": 1e6} for row in stored]
     dataset.write_rows("evaluations", old, **where)
     kept = read_evaluations(dataset, checkpoint.stem)
-    assert len(kept) == len(every) - len(stored)
+    assert len(kept) == len(every) - sum(row["prior"] == OWN for row in stored)
     assert "0" not in {row["planner_version"] for row in kept}
     (said,) = left_out(dataset, checkpoint.stem)
     assert said.startswith(f"{len(stored)} rows of planner 0 are left out")
@@ -466,14 +522,18 @@ def test_reruns_are_paired_and_hold_every_guide() -> None:
     assert len(tasks) == 5 * EVALUATION.tasks
     swept = 0
     for found in tasks.values():
-        # one unguided run stands beside all guided ones
-        for column in ("seconds_unguided", "nodes_unguided", "solved_unguided"):
-            assert len({row[column] for row in found}) == 1
+        # one unguided run that stops as they do stands beside all guided ones
+        for stop in ("first", "level"):
+            some = [row for row in found if row["stop"] == stop]
+            assert {GUIDES[row["guide"]].first for row in some} == {stop == "first"}
+            for column in ("seconds_unguided", "nodes_unguided", "solved_unguided"):
+                assert len({row[column] for row in some}) == 1
+        assert all(row["seconds_oracle"] > 0 for row in found)
         ran = {(row["guide"], row["beta"]) for row in found}
         assert {("prune", 0.0), ("prune-then-full", 0.0)} <= ran
         swept += ran >= {("prune", -50.0), ("prune", 50.0)}
         for row in found:
-            if row["guide"] == "prune-then-full" or row["beta"] == 50.0:
+            if row["guide"] != "prune" or row["beta"] == 50.0:
                 assert row["solved_guided"] == row["solved_unguided"]
             assert row["n_kept"] == {50.0: row["n_objects"], -50.0: 2}.get(
                 row["beta"], row["n_kept"]
@@ -490,8 +550,8 @@ def test_finished_shards_are_left_and_other_settings_replace_them(tmp_path) -> N
     assert count == len(Dataset.open(root).read_rows("evaluations"))
     seen = []
     fewer = replace(EVALUATION, tasks=1, sweep_tasks=0)
-    assert evaluate(root, checkpoint, fewer, progress=lambda *at: seen.append(at)) == 10
-    assert len(Dataset.open(root).read_rows("evaluations")) == 10
+    assert evaluate(root, checkpoint, fewer, progress=lambda *at: seen.append(at)) == 40
+    assert len(Dataset.open(root).read_rows("evaluations")) == 40
     assert seen == [(n, 5) for n in range(1, 6)]
 
 

@@ -266,6 +266,8 @@ def test_parameters_that_cannot_be_are_one_line(prefect_server: None, tmp_path: 
 
 def test_retrain_trains_evaluates_and_then_rests(dataset: Path) -> None:
     from flows.retrain import retrain
+    from relevance.networks import read_record
+    from relevance.store import Dataset
 
     def run() -> dict[str, Any]:
         return retrain(
@@ -290,11 +292,26 @@ def test_retrain_trains_evaluates_and_then_rests(dataset: Path) -> None:
     assert str(report) in artifacts["evaluation-summary"]["data"]
     metrics = json.loads(artifacts["train-metrics"]["data"])
     assert "on" in {row["group"] for row in metrics}
+    said = artifacts["champion"]["data"]
+    assert f"{checkpoint.stem}: {'promoted' if first['promoted'] else 'refused'}" in said
+    record = read_record(Dataset.open(dataset))
+    assert record.champion == (checkpoint.stem if first["promoted"] else None)
+    [event] = record.history
+    assert event.why in said
+    assert event.labels == sum(
+        row["split"] == "train" for row in Dataset.open(dataset).read_rows("labels")
+    )
     changed = checkpoint.stat().st_mtime_ns, report.stat().st_mtime_ns
     second = run()
     assert not second["new"]
     assert second["checkpoint"] == checkpoint.stem
     assert (checkpoint.stat().st_mtime_ns, report.stat().st_mtime_ns) == changed
+    # While it is being planned anew, what it holds now is not worth learning.
+    there = Dataset.open(dataset)
+    before = there.description
+    there.describe({**before, "next": {"config": before["config"]}})
+    assert run()["checkpoint"] is None
+    there.describe(before)
 
 
 def test_a_server_that_does_not_answer_is_named(
@@ -353,6 +370,7 @@ def _generate(root: Path, home: Path) -> subprocess.Popen[bytes]:
     )
 
 
+@pytest.mark.slow  # two servers and two runs, one of them killed
 def test_a_killed_flow_leaves_nobody_behind_and_resumes_to_the_same_bytes(
     home: Path, tmp_path: Path
 ) -> None:

@@ -29,6 +29,7 @@ from relevance.planner.kernels.kinematics import (
 )
 from relevance.planner.kernels.native import call
 from relevance.planner.kernels.planar import FOUND, NONE
+from relevance.planner.kernels.rows import WIDTH
 from relevance.robot import ARM, LINKS, panda, panda_urdf
 from relevance.scene import Box
 from relevance.scene.geometry import UPRIGHT, rectangle_gap, upright
@@ -290,7 +291,7 @@ def test_path_gradient_equals_finite_differences():
     shape = (len(samples), len(body.link), len(obstacles))
     multipliers = rng.uniform(0, 0.1, (7, 6)), rng.uniform(0, 0.1, shape), np.zeros((7, ARM, 2))
     margin = np.full(shape[1:], 0.05)
-    band, g = np.zeros((5 * ARM, 3 * ARM)), np.zeros(5 * ARM)
+    band, g = np.zeros((5 * ARM, WIDTH)), np.zeros(5 * ARM)
     at, smooth = arm_at(BASE), motions.smoothness(6)
     seen, room = np.zeros((*shape[:2], ARM)), np.zeros(shape[:2])
 
@@ -332,7 +333,7 @@ def test_smoothness_is_the_hessian_of_the_cost():
     band = motions.smoothness(T)
     found = np.zeros((n, n))
     for j in range(n):
-        for d in range(min(3 * ARM, n - j)):
+        for d in range(min(WIDTH, n - j)):
             found[j + d, j] = found[j, j + d] = band[j, d]
     np.testing.assert_allclose(found, expected)
 

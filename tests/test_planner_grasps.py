@@ -21,9 +21,9 @@ from relevance.planner.kernels.boxes import body_pose
 from relevance.planner.kernels.holds import FARTHEST, GRIP, GROUND, INSET, TILTS
 from relevance.planner.kernels.kinematics import FRAME, arm_at, hand_down, look_at_frames
 from relevance.planner.kernels.motions import reach_to
-from relevance.planner.path import Motion
+from relevance.planner.path import Motion, shoulder_depth
 from relevance.planner.problem import Problem
-from relevance.robot import panda
+from relevance.robot import HOME, panda
 from relevance.scene import Scene, scene_from_json
 from tests.planning import BLUE, GREY, OPEN, RED, box
 
@@ -194,6 +194,26 @@ def test_the_dense_check_fails_what_breaks_a_limit_or_the_goal():
     assert "times its speed limit" in broken(problem, replace(motion, phases=(fast,)))
     assert "is not true" in broken(problem, replace(motion, final={}))
     assert "penetrated" in broken(problem, replace(motion, max_penetration=2e-3))
+    (where,) = result.final.values()
+    beyond = replace(where, position=(0.39, 0.0, 0.03), on=None)
+    off = replace(motion, final={"red": beyond})
+    assert broken(problem, off) == "red is not put on the table"
+
+
+def test_a_box_in_the_hand_is_held_against_the_arm_itself():
+    """The first link turns with the arm, and so must what is held against it."""
+    problem = Problem(OPEN, OPEN.goal("on(red, blue)"))
+    box = problem.boxes["red"]
+    grasp = grasps(box)[0]
+    held = carried(box, grasp, 1.0)
+    folded = (-1.2, 0.0, -3.0, 0.0, 1.0, 0.8)
+    depths = []
+    for turn in (0.0, 1.0, -2.0):
+        rows = np.tile([turn, *folded], (2, 1))
+        depths.append(shoulder_depth(problem, rows, grasp.opening, held))
+    assert depths[0] > 0.005
+    assert depths == pytest.approx([depths[0]] * 3)
+    assert shoulder_depth(problem, np.tile(HOME, (2, 1)), grasp.opening, held) == 0.0
 
 
 def test_a_trajectory_is_the_plan():

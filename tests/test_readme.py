@@ -28,15 +28,18 @@ NOT_RUN = {
     r"^(make|pip|git clone|apt-get|python3? -m venv)\b|\.venv/": "installs, or runs for minutes",
     r"^(prefect|export PREFECT_)": "needs a server: tests/test_flows.py runs server and worker",
     r"s3://|tcp://|AWS_": "needs an object store or a cluster: tests/test_many.py has both",
-    r"^relevance (demo|dashboard)\b": "serves, or takes minutes: they have tests of their own",
+    r"^relevance (demo|dashboard|view)\b": "serves, or takes minutes: they have tests of their own",
     r"\brai\b": "needs rai, which is an extra: tests/test_rai.py",
     r"^(duckdb|D) ": "the duckdb program is not installed with the project",
     r"^relevance bench\b": "measures for minutes: tests/test_benchmarks.py",
     r"^relevance diff\b": "needs a dataset that was planned anew: tests/test_families.py",
     r"laptop|paper": "makes much",
+    r" FILE\b|--coverage": "takes a calibration on many scenes: tests/test_coverage.py",
 }
 """Lines of shell that are left out, and why."""
-SLOW = r"^relevance (append|merge|repair|label|generate|export|train|evaluate|check)\b"
+SLOW = (
+    r"^relevance (append|merge|repair|label|generate|export|train|evaluate|check|suite|coverage)\b"
+)
 """Lines that take their time; only the slow test runs them."""
 DRAWING = r"[│├└→]|->|^[A-Z]+/\s*$|\.parquet|\.tar"
 """A block without a language that shows something and asks for nothing."""

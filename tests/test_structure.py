@@ -38,6 +38,8 @@ DOORS = {
     "matplotlib": ("report", "benchmarks"),
     "robotic": ("planner",),
     "jinja2": ("report",),
+    "viser": ("report",),
+    "yourdfpy": ("report",),
     "prefect": ("flows",),
     "prefect_dask": ("flows",),
     "streamlit": ("dashboards",),

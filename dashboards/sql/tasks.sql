@@ -1,27 +1,52 @@
--- Planned goals of one split for the grid of scenes: the relevant objects, and the scores of
--- one checkpoint as a map from name to score.
-WITH scored AS (
-    SELECT
-        scene_id, predicate, subject, reference,
-        map_from_entries(list({'k': query, 'v': score} ORDER BY query)) AS scores
+-- Planned goals of one split that fit, some rows of them, and in each how many there are in all.
+-- Variables: split, families, predicates, statuses, fewest and most boxes, blocked (only plans that
+-- move a query), checkpoint_id, beta, wrong (only goals that the checkpoint misjudges, the worst
+-- first), skip and rows.
+WITH
+judged_wrongly AS (
+    SELECT scene_id, predicate, subject, reference, count(*) AS wrong
     FROM predictions
-    WHERE checkpoint_id = $checkpoint_id AND split = $split
+    WHERE checkpoint_id = getvariable('checkpoint_id')
+        AND split = coalesce(getvariable('split'), 'test')
+        AND NOT is_goal_object
+        AND (score > -coalesce(getvariable('beta'), 0)) <> relevant
     GROUP BY ALL
 ),
-labelled AS (
-    SELECT plan_id, list(query ORDER BY query) FILTER (relevant) AS relevant
-    FROM labels
-    WHERE split = $split
-    GROUP BY plan_id
+sized AS (
+    SELECT split, scene_id, family, n_objects
+    FROM scenes
+    WHERE split = coalesce(getvariable('split'), 'test')
+),
+-- (asked twice, and not kept: of the plans that fit only the ids are held, and of those a few)
+fitting AS NOT MATERIALIZED (
+    SELECT p.plan_id, coalesce(w.wrong, 0) AS wrong
+    FROM plans AS p
+    JOIN sized AS s USING (split, scene_id)
+    LEFT JOIN judged_wrongly AS w USING (scene_id, predicate, subject, reference)
+    WHERE list_contains(coalesce(getvariable('families'), [s.family]), s.family)
+        AND list_contains(coalesce(getvariable('predicates'), [p.predicate]), p.predicate)
+        AND list_contains(coalesce(getvariable('statuses'), [p.status]), p.status)
+        AND s.n_objects
+            BETWEEN coalesce(getvariable('fewest'), 0) AND coalesce(getvariable('most'), 999)
+        AND (
+            NOT coalesce(getvariable('blocked'), false)
+            OR len(list_filter(p.moved, lambda name: name NOT IN (p.subject, p.reference))) > 0
+        )
+        AND (NOT coalesce(getvariable('wrong'), false) OR w.wrong > 0)
+),
+chosen AS (
+    SELECT
+        plan_id, wrong,
+        CASE WHEN coalesce(getvariable('wrong'), false) THEN -wrong ELSE 0 END AS worst
+    FROM fitting
+    ORDER BY worst, md5(plan_id)
+    LIMIT coalesce(getvariable('rows'), 20) OFFSET coalesce(getvariable('skip'), 0)
 )
 SELECT
-    p.plan_id, p.scene_id, p.shard, p.predicate, p.subject, p.reference,
-    p.status, p.reason, p.actions, coalesce(l.relevant, []) AS relevant, s.scores,
-    len(list_filter(p.moved, lambda name: name NOT IN (p.subject, p.reference))) AS blockers
-FROM plans AS p LEFT JOIN scored AS s USING (scene_id, predicate, subject, reference)
-LEFT JOIN labelled AS l USING (plan_id)
-LEFT JOIN shard_families AS f ON f.split = p.split AND f.shard = p.shard
-WHERE p.split = $split AND p.predicate IN (SELECT unnest($predicates::VARCHAR[]))
-    AND f.family IN (SELECT unnest($families::VARCHAR[]))
-    AND p.status IN (SELECT unnest($statuses::VARCHAR[]))
-ORDER BY md5(p.plan_id);
+    p.plan_id, p.scene_id, p.split, p.shard, s.family, s.n_objects, p.predicate, p.subject,
+    p.reference, p.status, p.reason, p.actions, p.holds, c.wrong,
+    (SELECT count(*) FROM fitting) AS found
+FROM chosen AS c
+JOIN plans AS p USING (plan_id)
+JOIN sized AS s USING (split, scene_id)
+ORDER BY c.worst, md5(p.plan_id);

@@ -7,8 +7,10 @@ unless a name says wall; intervals are 95%: bootstrap for times, Wilson for shar
 
 from relevance.benchmarks.against import find_unsolved, measure_against
 from relevance.benchmarks.completeness import measure_completeness
+from relevance.benchmarks.guides import LIMITS, Rerun, Settings, read_reruns, rerun_guides
 from relevance.benchmarks.plots import save
 from relevance.benchmarks.runs import Measured
+from relevance.benchmarks.savings import Figures, figures, measured_guides
 from relevance.benchmarks.searches import (
     CAPPED,
     MAX_EDGE,
@@ -23,13 +25,18 @@ from relevance.benchmarks.versus import measure_versus
 
 __all__ = [
     "CAPPED",
+    "LIMITS",
     "MAX_EDGE",
     "SIZES",
     "BenchmarkError",
+    "Figures",
     "Measured",
+    "Rerun",
     "Scenes",
+    "Settings",
     "Task",
     "draw",
+    "figures",
     "find_unsolved",
     "measure_against",
     "measure_completeness",
@@ -38,5 +45,8 @@ __all__ = [
     "measure_searches",
     "measure_stability",
     "measure_versus",
+    "measured_guides",
+    "read_reruns",
+    "rerun_guides",
     "save",
 ]

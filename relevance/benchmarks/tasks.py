@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import colorsys
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from relevance.counters import generator
 from relevance.errors import RelevanceError
-from relevance.sampling import SceneConfig, sample_goals, sample_scene
+from relevance.sampling import ATTEMPTS, SceneConfig, sample_task
 from relevance.scene import (
     PREDICATES,
     Box,
@@ -35,8 +35,6 @@ Scenes = Literal["ours", "foreign"]
 
 BOXES = (3, 10)
 """Fewest and most boxes of a task, stacked ones included."""
-ATTEMPTS = 2000
-"""Draws of one scene before its size counts as impossible."""
 _STREAM = "bench"  # a split of its own: never a scene of a dataset
 EDGES = (0.04, 0.12)
 """Shortest and longest edge of a foreign box, m."""
@@ -126,19 +124,12 @@ def _predicates(scenes: Scenes) -> tuple[Predicate, ...]:
 def _task(
     index: int, predicate: Predicate, boxes: int, seed: int, max_edge: float, stream: str
 ) -> Task:
-    # Of any number of boxes are those with stacks, which have one more than their config says.
-    count = boxes - (predicate.stacked)
-    family = "stacks" if predicate.stacked else predicate.family
-    start = SceneConfig(family=family, min_objects=2, max_edge=max_edge)
-    config = replace(start, min_objects=count, max_objects=count)
-    for attempt in range(ATTEMPTS):
-        scene = sample_scene(config, seed=seed, index=index, split=stream, attempt=attempt)
-        if scene is None:
-            continue
-        goals = sample_goals(scene, predicate, 1, seed=seed)
-        if goals:
-            return Task(index=index, scene=scene, goal=goals[0])
-    raise BenchmarkError(f"{boxes} boxes: no scene in {ATTEMPTS} draws, expected fewer boxes")
+    start = SceneConfig(min_objects=2, max_edge=max_edge)
+    found = sample_task(start, predicate, boxes, seed=seed, index=index, split=stream)
+    if found is None:
+        raise BenchmarkError(f"{boxes} boxes: no scene in {ATTEMPTS} draws, expected fewer boxes")
+    scene, goal = found
+    return Task(index=index, scene=scene, goal=goal)
 
 
 def _foreign_task(

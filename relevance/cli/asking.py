@@ -1,4 +1,4 @@
-"""Subcommands that ask a dataset: check, sql, stats, report."""
+"""Subcommands that ask a dataset: check, sql, stats, suites, report."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import dataclasses
@@ -109,6 +109,43 @@ def _stats(_: Preset) -> Callable[..., int]:
     return stats
 
 
+def _suites(_: Preset) -> Callable[..., int]:
+    def suites(
+        datasets: Annotated[
+            tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="DATASET...")
+        ] = (),
+        checkpoint: Annotated[str, tyro.conf.arg(metavar="CHECKPOINT")] = "glimpse",
+        format: Format = "table",
+    ) -> int:
+        """Say which test sets away from home there are, or what a checkpoint is worth on some.
+
+        A row a dataset, of what it holds: `relevance evaluate DATASET --checkpoint ...` first.
+
+        Args:
+            datasets: Folders of labelled datasets, suites or any other; none lists the suites.
+            checkpoint: A file, or the name of a model that comes with this package.
+            format: How to print the rows.
+        """
+        from relevance.evaluation import SUITES, away
+
+        if not datasets:
+            rows = [
+                [suite.name, ", ".join(suite.families), suite.about] for suite in SUITES.values()
+            ]
+            show(("suite", "families", "what differs"), rows, format)
+            return 0
+        found = away(datasets, checkpoint)
+        columns = list(dict.fromkeys(key for row in found for key in row))
+        rows = [[row.get(key) for key in columns] for row in found]
+        if format == "table":  # few rows of many figures
+            wide = [[name, *values] for name, *values in zip(columns, *rows, strict=True)]
+            columns, rows = [str(value) for value in wide[0]], wide[1:]
+        show(columns, rows, format, title=f"{checkpoint} away from home")
+        return 0
+
+    return suites
+
+
 def _report(_: Preset) -> Callable[..., int]:
     def report(dataset: DatasetArg, out: OptionalPath = None) -> int:
         """Write the report, one HTML file that opens offline; prints its path.
@@ -154,6 +191,11 @@ COMMANDS = {
         make=_stats,
         about="label balance, plan lengths, visibility",
         examples=("relevance stats data/tables", "relevance stats data/tables --card out/card"),
+    ),
+    "suites": Command(
+        make=_suites,
+        about="what a checkpoint is worth away from home",
+        examples=("relevance suites", "relevance suites data/boxes-20 --checkpoint model.pt"),
     ),
     "report": Command(
         make=_report,

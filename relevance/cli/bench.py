@@ -136,12 +136,12 @@ def _against(
     peer.warm_up()
     config = settings_of(peer.Config, seconds=limit)
     drawn = benchmarks.draw(tasks, seed, scenes=scenes)
-    _write_scenes(folder / "scenes.jsonl", drawn)
+    write_scenes(folder / "scenes.jsonl", drawn)
     hard: list[Any] = []
     if unsolved:
         with bar("tasks that ours leaves unsolved") as progress:
             hard = benchmarks.find_unsolved(unsolved, seed, scenes=scenes, progress=progress)
-        _write_scenes(folder / "scenes-unsolved.jsonl", hard)
+        write_scenes(folder / "scenes-unsolved.jsonl", hard)
         if len(hard) < unsolved:
             say(f"only {len(hard)} tasks are unsolved of those drawn")
     yield (
@@ -172,8 +172,8 @@ def _versus(
         max_edge=benchmarks.MAX_EDGE,
         stream="bench growth",
     )
-    _write_scenes(folder / "scenes.jsonl", drawn)
-    _write_scenes(folder / "scenes-growth.jsonl", grown)
+    write_scenes(folder / "scenes.jsonl", drawn)
+    write_scenes(folder / "scenes-growth.jsonl", grown)
     yield (
         "tasks by both checkouts",
         lambda progress: benchmarks.measure_versus(
@@ -193,7 +193,7 @@ def _work(
         return
     drawn = draw(tasks, seed, scenes=scenes)
     half = drawn[: max(tasks // 2, 1)]
-    _write_scenes(folder / "scenes.jsonl", drawn)
+    write_scenes(folder / "scenes.jsonl", drawn)
     if {"speed", "truth"} & set(parts):
         speed, truth = "speed" in parts, "truth" in parts
         yield (
@@ -235,15 +235,15 @@ def _work(
         )
 
 
-def hand_over(measured: Any, folder: Path) -> None:
+def hand_over(measured: Any, folder: Path, *, summary: bool = False) -> None:
     """Print a part's tables; write its rows and its plots."""
     for table in measured.tables:
         show(table.columns, table.rows, "table", title=table.title)
-    write(measured, folder)
+    write(measured, folder, summary=summary)
 
 
-def write(measured: Any, folder: Path) -> None:
-    """Write a part's rows and its plots."""
+def write(measured: Any, folder: Path, *, summary: bool = False) -> None:
+    """Write a part's rows and its plots; with `summary` its tables, too."""
     from relevance.benchmarks import save
 
     records = measured.records()
@@ -253,11 +253,14 @@ def write(measured: Any, folder: Path) -> None:
         writer.writerows(records)
     for plot in measured.plots:
         save(plot, folder)
+    if summary:
+        tables = [dataclasses.asdict(table) for table in measured.tables]
+        (folder / "summary.json").write_text(to_json({"tables": tables}) + "\n")
     if measured.exceptions:
-        _write_scenes(folder / EXCEPTIONS, measured.exceptions, mode="a")
+        write_scenes(folder / EXCEPTIONS, measured.exceptions, mode="a")
 
 
-def _write_scenes(file: Path, tasks: Sequence[Any], mode: Literal["w", "a"] = "w") -> None:
+def write_scenes(file: Path, tasks: Sequence[Any], mode: Literal["w", "a"] = "w") -> None:
     """The tasks as `relevance plan` reads them, one scene with its goal a line."""
     from relevance.scene import scene_to_json
 

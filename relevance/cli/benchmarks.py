@@ -1,17 +1,19 @@
-"""The subcommands `bench planner`, `bench dataset` and `bench training`."""
+"""The subcommands `bench planner`, `bench guides`, `bench dataset` and `bench training`."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import os
 import secrets
 import tempfile
+import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from relevance.cli.arguments import Command, Preset, at_least, one_of
-from relevance.cli.bench import bench_planner, hand_over, write
+from relevance.cli.bench import bench_planner, hand_over, write, write_scenes
 from relevance.cli.terminal import bar, say
 
 Part = Literal["making", "reading", "queries", "crashes"]
@@ -20,7 +22,92 @@ OptionalSeed = Annotated[int | None, tyro.conf.arg(metavar="N")]
 Bodies = Annotated[tuple[str, ...], tyro.conf.arg(metavar="BODY")]
 Recipes = Annotated[tuple[str, ...], tyro.conf.arg(metavar="RECIPE")]
 Seeds = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N")]
+Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")]
+Sizes = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N")]
+EVERY, SHARE = 120.0, 0.05
+"""Seconds after which tables and plots of a run that goes on are written again, and the most of its
+time that this takes."""
 OptionalFolder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")]
+
+
+def _guides(_: Preset) -> Callable[..., int]:
+    def bench(
+        tasks: int = 500,
+        goals: int = 5,
+        sizes: Sizes = (3, 5, 10, 15, 20, 30),
+        priors: Names = ("glimpse",),
+        guides: Names = ("order", "lazy"),
+        searches: tuple[Literal["tree", "informed"], ...] = ("tree", "informed"),
+        node_limit: int = 200_000,
+        max_actions: int = 12,
+        repeats: int = 1,
+        seed: OptionalSeed = None,
+        out: OptionalFolder = None,
+    ) -> int:
+        """Measure what guides save the planner, by the number of boxes, on fresh random tasks.
+
+        Each task is planned unguided, with every prior and guide, and with true labels, in turns in
+        one process. Prints tables and writes them (summary.json), one row a run (guides.csv), the
+        scenes and plots, now and then: a killed run goes on with --out and the same
+        settings, more tasks or sizes included. For steady times let nothing else run.
+
+        Args:
+            tasks: How many tasks of each size.
+            goals: Most goals of a scene; the look is given alone and shared by them.
+            sizes: Numbers of boxes.
+            priors: Who scores the objects: models of the package (glimpse, geometry), files
+                (model.pt), or true, all, none, random, distance, swept. True labels are always
+                rerun.
+            guides: How the scores enter the search: prune, prune-then-full, expand, order,
+                shortest, lazy.
+            searches: The paper's breadth-first tree, our informed search, or both.
+            node_limit: Most nodes that a search may open for a goal.
+            max_actions: Most picks and places in a plan.
+            repeats: Timed runs of each task and guide; the median counts.
+            seed: Remakes the tasks of an earlier run; a fresh one when not given.
+            out: Folder for rows, tables and plots; data/bench/guides-SEED when not given.
+        """
+        for flag, count in (("tasks", tasks), ("goals", goals), ("node-limit", node_limit)):
+            at_least(f"--{flag}", count, 1)
+        at_least("--max-actions", max_actions, 2)
+        at_least("--repeats", repeats, 1)
+        at_least("--seed", seed, 0, 2**31)
+        for size in sizes:
+            at_least("--sizes", size, 3)
+        seed = secrets.randbits(31) if seed is None else seed
+        folder = out or Path("data/bench") / f"guides-{seed}"
+        folder.mkdir(parents=True, exist_ok=True)
+        say(f"seed {seed}, pid {os.getpid()}, to {folder}")
+        from relevance import benchmarks
+        from relevance.planner import PlannerConfig
+
+        settings = benchmarks.Settings(
+            seed=seed,
+            goals=goals,
+            searches=searches,
+            priors=priors,
+            guides=guides,
+            repeats=repeats,
+            planner=PlannerConfig(node_limit=node_limit, max_actions=max_actions),
+        )
+        rows, due = [], time.monotonic() + EVERY
+        with bar("tasks") as progress:
+            for rows in benchmarks.rerun_guides(
+                settings,
+                folder,
+                tasks=tasks,
+                sizes=sizes,
+                scenes=partial(write_scenes, folder / "scenes.jsonl", mode="a"),
+                progress=progress,
+            ):
+                if (began := time.monotonic()) > due:
+                    write(benchmarks.measured_guides(rows), folder, summary=True)
+                    took = time.monotonic() - began
+                    due = began + took + max(EVERY, took / SHARE)
+        hand_over(benchmarks.measured_guides(rows), folder, summary=True)
+        return 0
+
+    return bench
 
 
 def _bench(_: Preset) -> Callable[..., int]:
@@ -193,6 +280,15 @@ COMMANDS = {
             "relevance bench planner --tasks 1000",
             "relevance bench planner --tasks 200 --seed 7 --parts speed truth",
             "relevance bench planner --tasks 60 --against rai",
+        ),
+    ),
+    "bench guides": Command(
+        make=_guides,
+        about="what guides save the planner, by the number of boxes",
+        examples=(
+            "relevance bench guides",
+            "relevance bench guides --tasks 30 --sizes 10 20 --seed 7",
+            "relevance bench guides --priors glimpse geometry swept --guides order lazy expand",
         ),
     ),
     "bench dataset": Command(

@@ -8,17 +8,30 @@ imports the rest when it runs.
 from relevance.cli import (
     asking,
     benchmarks,
+    champions,
     learning,
     making,
     planning,
     predicting,
     running,
     sharing,
+    viewing,
 )
 from relevance.cli.arguments import Command
 
 COMMANDS: dict[str, Command] = {
     name: command
-    for group in (making, learning, planning, predicting, asking, sharing, running, benchmarks)
+    for group in (
+        making,
+        learning,
+        champions,
+        planning,
+        viewing,
+        predicting,
+        asking,
+        sharing,
+        running,
+        benchmarks,
+    )
     for name, command in group.COMMANDS.items()
 }

@@ -1,14 +1,21 @@
-"""Subcommands about models: train, ship, evaluate."""
+"""Subcommands about models: train, ship, tune, evaluate, calibrate, coverage."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from relevance.cli.arguments import Command, DatasetArg, OptionalName, OptionalPath, Preset
-from relevance.cli.terminal import bar, say
+from relevance.cli.arguments import (
+    Command,
+    DatasetArg,
+    OptionalName,
+    OptionalPath,
+    Preset,
+    at_least,
+)
+from relevance.cli.terminal import Format, bar, say, show
 
 
 def _start(preset: str, body: str | None) -> Any:
@@ -76,6 +83,47 @@ def _ship(preset: str, body: str | None = None) -> Callable[..., int]:
     return ship
 
 
+def _tune(_: Preset) -> Callable[..., int]:
+    from relevance.evaluation import TuningConfig
+
+    start = TuningConfig()
+
+    def tune(
+        dataset: DatasetArg,
+        checkpoint: OptionalPath = None,
+        config: Annotated[TuningConfig, tyro.conf.arg(name="")] = start,
+    ) -> int:
+        """Choose when a lazy guide looks: the work that saves most on validation tasks.
+
+        It is kept in the checkpoint's file, where guides find it; its id stays.
+
+        Args:
+            dataset: Folder of a labelled dataset.
+            checkpoint: The model, a file or an id; the dataset's newest when not given.
+        """
+        from relevance import evaluation
+        from relevance.training import find_checkpoint
+
+        path = find_checkpoint(dataset, checkpoint)
+        with bar("tasks") as progress:
+            tuned = evaluation.tune(dataset, path, config, progress=progress)
+        columns = ("patience", "work a task", "of unguided", "looked")
+        rows = [
+            (
+                one.patience,
+                one.work / tuned.runs,
+                one.work / max(tuned.unguided, 1),
+                one.looks / tuned.runs,
+            )
+            for one in tuned.tried
+        ]
+        show(columns, rows, "table", title=f"{tuned.runs} runs, to the first plan, looks included")
+        say(f"{path}: a lazy guide looks after work of {tuned.patience}")
+        return 0
+
+    return tune
+
+
 def _evaluate(preset: Preset) -> Callable[..., int]:
     from relevance.evaluation import EvaluationConfig
 
@@ -91,7 +139,7 @@ def _evaluate(preset: Preset) -> Callable[..., int]:
 
         Args:
             dataset: Folder of a labelled dataset.
-            checkpoint: The model, a file or an id; the dataset's newest when not given.
+            checkpoint: The model, a file or an id; the dataset's champion, else its newest.
             preset: Where the other settings start from.
         """
         from relevance import evaluation
@@ -107,6 +155,119 @@ def _evaluate(preset: Preset) -> Callable[..., int]:
         return 0
 
     return evaluate
+
+
+def _calibrate(_: Preset) -> Callable[..., int]:
+    def calibrate(
+        dataset: DatasetArg,
+        checkpoint: OptionalPath = None,
+        split: Literal["validation", "test"] = "validation",
+        format: Format = "table",
+    ) -> int:
+        """Learn how much to keep so that nothing relevant is left out, with a stated probability.
+
+        Stored in the checkpoint's file, for `relevance plan --coverage 0.95`. What was there of
+        another calibration is replaced. Prints the beta of each predicate.
+
+        Args:
+            dataset: Folder of a labelled dataset whose scenes are drawn as those to come.
+            checkpoint: The model, a file or an id; the dataset's newest when not given.
+            split: Whose scenes; never those that it was trained on.
+            format: How to print the rows.
+        """
+        from relevance import evaluation
+        from relevance.training import find_checkpoint
+
+        path = find_checkpoint(dataset, checkpoint)
+        with bar("shards scored") as progress:
+            found = evaluation.calibrate(dataset, path, split=split, progress=progress)
+        columns = ("predicate", "family", "scenes", "goals", *map(_percent, evaluation.LEVELS))
+        rows = [
+            [name, family, needs.scenes, needs.goals, *map(needs.beta, evaluation.LEVELS)]
+            for name, families in found.needs.items()
+            for family, needs in families.items()
+        ]
+        show(columns, rows, format, title=f"beta that keeps all that is relevant: {path}")
+        return 0
+
+    return calibrate
+
+
+def _coverage(preset: Preset) -> Callable[..., int]:
+    from relevance.evaluation import LEVELS
+
+    def coverage(
+        dataset: DatasetArg,
+        checkpoint: OptionalPath = None,
+        levels: Annotated[tuple[float, ...], tyro.conf.arg(metavar="SHARE")] = LEVELS,
+        split: Literal["validation", "test"] = "test",
+        tasks: int = 0,
+        format: Format = "table",
+    ) -> int:
+        """Hold a calibrated checkpoint to its promises: what was kept whole of unseen goals.
+
+        One goal a scene counts for the exact 95% interval (low, high): goals of one scene are not
+        independent. `breached` says that the whole interval lies below what was promised.
+
+        Args:
+            dataset: Folder of a labelled dataset, any.
+            checkpoint: The model, a file or an id; the dataset's newest when not given.
+            levels: The coverages to look at.
+            split: Whose scenes.
+            tasks: Goals of each predicate that are also planned, unguided and pruned at every
+                coverage; 0 plans none.
+            format: How to print the rows.
+        """
+        from relevance import evaluation
+        from relevance.store import Dataset
+        from relevance.training import find_checkpoint
+
+        at_least("--tasks", tasks, 0)
+        path = find_checkpoint(dataset, checkpoint)
+        calibration = evaluation.read_calibration(path, levels)
+        with bar("shards scored") as progress:
+            evaluation.predict(dataset, path, split=split, progress=progress)
+        scored = Dataset.open(dataset)
+        predictions = evaluation.read_predictions(
+            scored, evaluation.checkpoint_id(path), split=split
+        )
+        for why in evaluation.out_of_reach(predictions, calibration, levels=levels):
+            say(why)
+        columns = ("goals of", "promised", "reached", "low", "high", "scenes", "all goals")
+        columns = (*columns, "beta", "boxes", "kept", "breached")
+        rows = [
+            [
+                *(c.group, c.coverage, c.reached.value, c.reached.low, c.reached.high),
+                *(c.reached.n, c.reached_all, c.beta, c.objects, c.kept),
+                c.breached if format == "json" else "yes" if c.breached else "no",
+            ]
+            for c in evaluation.covered(predictions, calibration, levels=levels)
+        ]
+        show(columns, rows, format, title=f"coverage of {path} on {dataset}")
+        if tasks:
+            config = evaluation.EvaluationConfig(tasks=tasks, split=split)
+            with bar("tasks") as progress:
+                speeds = evaluation.covered_speeds(
+                    dataset, path, config, levels=levels, progress=progress
+                )
+            columns = ("promised", "search", "guide", "tasks", "solvable", "missed", "kept")
+            columns = (*columns, "speed-up", "speed-up, misses left out")
+            rows = [
+                [
+                    *(level, c.search, c.guide, c.n_tasks, c.n_solvable, c.misses, c.kept),
+                    *(c.speedup.value, c.speedup_both.value),
+                ]
+                for level, found in speeds.items()
+                for c in found
+            ]
+            show(columns, rows, format, title="speed-up at each coverage, misses counted")
+        return 0
+
+    return coverage
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:g}%"
 
 
 COMMANDS = {
@@ -128,9 +289,27 @@ COMMANDS = {
         presets=(*get_args(Preset), "fair"),
         decides=("--model.body",),
     ),
+    "tune": Command(
+        make=_tune,
+        about="choose when a lazy guide looks",
+        examples=("relevance tune data/tables", "relevance tune data/tables --tasks 100"),
+    ),
     "evaluate": Command(
         make=_evaluate,
         about="rerun the planner with a model's guidance",
         examples=("relevance evaluate data/tables --tasks 100 --guides prune prune-then-full",),
+    ),
+    "calibrate": Command(
+        make=_calibrate,
+        about="how much to keep for a promised recall",
+        examples=("relevance calibrate data/tables",),
+    ),
+    "coverage": Command(
+        make=_coverage,
+        about="what a promised recall came to on unseen scenes",
+        examples=(
+            "relevance coverage data/tables",
+            "relevance coverage data/tables --levels 0.9 0.95 --tasks 40",
+        ),
     ),
 }

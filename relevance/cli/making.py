@@ -1,9 +1,10 @@
-"""Subcommands that make datasets: estimate, generate, label, append, repair."""
+"""Subcommands that make datasets: estimate, generate, label, append, repair, suite."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import tyro
@@ -273,6 +274,38 @@ def _repair(_: Preset) -> Callable[..., int]:
     return repair
 
 
+def _suite(_: Preset) -> Callable[..., int]:
+    def suite(
+        name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")],
+        out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")],
+        scenes: int = 100,
+        workers: Workers = CORES,
+    ) -> int:
+        """Make a test set that is drawn otherwise than what networks learn from, labels too.
+
+        `relevance suites` says which there are. Started again with more scenes it grows.
+
+        Args:
+            name: Which one, e.g. boxes-20.
+            out: Folder of the dataset.
+            scenes: Scenes of each of its families.
+            workers: Processes that work at a time.
+        """
+        from relevance.evaluation import SUITES
+        from relevance.pipeline import labels_work, scenes_work
+
+        at_least("--scenes", scenes, 1)
+        check_workers(workers)
+        config = SUITES[name].config(scenes)
+        made = make("scenes", scenes_work(out, config), workers)
+        say(f"{out}: {made.summary}")
+        made = make("scenes labelled", labels_work(out), workers)
+        say(f"{out}: {made.summary}")
+        return 0
+
+    return suite
+
+
 COMMANDS = {
     "estimate": Command(
         make=_estimate,
@@ -307,5 +340,10 @@ COMMANDS = {
         make=_repair,
         about="make anew what is broken or missing",
         examples=("relevance repair data/tables",),
+    ),
+    "suite": Command(
+        make=_suite,
+        about="a test set away from what networks learned from",
+        examples=("relevance suite boxes-20 data/boxes-20 --scenes 50",),
     ),
 }

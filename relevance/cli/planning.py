@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -14,6 +14,7 @@ from relevance.cli.arguments import Command, OptionalPath, Preset, at_least, one
 from relevance.cli.terminal import UsageError, bar, to_json
 
 Name = Annotated[str, tyro.conf.arg(metavar="NAME")]
+OptionalShare = Annotated[float | None, tyro.conf.arg(metavar="SHARE")]
 
 
 def _plan(_: Preset) -> Callable[..., int]:
@@ -31,6 +32,7 @@ def _plan(_: Preset) -> Callable[..., int]:
         guide: Name = "none",
         checkpoint: OptionalPath = None,
         beta: float = 0.0,
+        coverage: OptionalShare = None,
         limit: int = default.node_limit,
         max_actions: int = default.max_actions,
         seconds: float = 30.0,
@@ -52,6 +54,8 @@ def _plan(_: Preset) -> Callable[..., int]:
             checkpoint: The model that scores the objects, which a guide needs: a file, or the name
                 of one that comes with the package (glimpse, geometry).
             beta: An object is kept when its score exceeds -beta.
+            coverage: Instead of a beta, with what probability at least all relevant objects are
+                kept, e.g. 0.95; for a checkpoint that `relevance calibrate` has seen.
             limit: Most nodes that the search may open for a goal.
             max_actions: Most picks and places in a plan.
             seconds: CPU seconds that rai has for a goal (--search, --limit and --max-actions
@@ -67,6 +71,8 @@ def _plan(_: Preset) -> Callable[..., int]:
         at_least("--seconds", seconds, 0.001)
         at_least("--beta", beta, -math.inf)
         _check_trajectory(trajectory)
+        if coverage is not None and checkpoint is None:
+            raise UsageError("--coverage needs a --guide and a --checkpoint")
         if GUIDES[guide].guided != (checkpoint is not None):
             raise UsageError("--guide and --checkpoint go together: a guide needs a model")
         chosen = PLANNERS[planner]
@@ -91,7 +97,7 @@ def _plan(_: Preset) -> Callable[..., int]:
         if checkpoint:
             from relevance.evaluation import load_guide
 
-            guidance = load_guide(checkpoint, mode=cast(Any, guide), beta=beta)
+            guidance = load_guide(checkpoint, mode=guide, beta=beta, coverage=coverage)
         chosen.warm_up()
         refused = 0
         with bar("goals", quiet=not json and sys.stdout.isatty()) as progress:
@@ -133,6 +139,7 @@ def plan_line(scene_id: str, result: Any) -> dict[str, Any]:
         "ambiguous": result.ambiguous,
         "seconds": result.seconds.total,
         "counts": counts,
+        "looked": result.looked,
         "replay": verdict
         and {
             "ok": verdict.ok,
@@ -197,6 +204,7 @@ COMMANDS = {
             "relevance plan scenes.jsonl --json",
             "relevance plan scene.json --goal 'on(red, blue)' --search tree",
             "relevance plan scenes.jsonl --guide prune-then-full --checkpoint model.pt",
+            "relevance plan scenes.jsonl --guide prune --checkpoint model.pt --coverage 0.95",
             "relevance plan scenes.jsonl --planner rai --seconds 10",
             "relevance plan scenes.jsonl --trajectory plan.npz",
             "relevance plan - < scenes.jsonl",

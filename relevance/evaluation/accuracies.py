@@ -27,6 +27,8 @@ class Predictions:
     predicate: np.ndarray
     family: np.ndarray
     """Of the scene."""
+    scene: np.ndarray
+    """Number of the scene that the row belongs to."""
     task: np.ndarray
     """Number of the task that the row belongs to."""
     relevant: np.ndarray
@@ -88,6 +90,7 @@ def read_predictions(dataset: Dataset, checkpoint_id: str, *, split: str = "test
             """
             select predicate, family, relevant, score, raw_score, is_goal_object, stands,
                 n_objects, visible_fraction, ambiguous, query = subject as is_subject,
+                dense_rank() over (order by scene_id) as scene,
                 dense_rank() over (order by scene_id, predicate, subject, reference) as task
             from judged
             where checkpoint_id = ? and split = ? and policy = ?
@@ -95,7 +98,8 @@ def read_predictions(dataset: Dataset, checkpoint_id: str, *, split: str = "test
             """,
             [checkpoint_id, split, policy],
         ).fetchnumpy()
-    kinds = {"predicate": str, "family": str, "stands": str, "task": int, "n_objects": int}
+    kinds = {"predicate": str, "family": str, "stands": str, "scene": int, "task": int}
+    kinds |= {"n_objects": int}
     kinds |= dict.fromkeys(("relevant", "is_goal_object", "is_subject", "ambiguous"), bool)
     return Predictions(
         **{name: np.asarray(column, kinds.get(name, float)) for name, column in columns.items()}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +54,19 @@ class Seen:
     """(H, W, 3) uint8."""
     views: Mapping[str, np.ndarray]
     """By name, (32, 32, 3) uint8."""
-    crops: Mapping[str, Crop]
+    crops: Mapping[str, Crop] = field(default_factory=dict)
     """Those that were cut from the picture."""
+
+    def __post_init__(self) -> None:
+        shapes = {"image": (self.image, (*self.image.shape[:2], 3))}
+        shapes |= {f"view {n}": (v, (VIEW_SIZE, VIEW_SIZE, 3)) for n, v in self.views.items()}
+        for name, (pixels, expected) in shapes.items():
+            if pixels.shape != expected or pixels.dtype != np.uint8:
+                raise PictureError(
+                    f"{name}: {pixels.shape} {pixels.dtype}, expected {expected} uint8"
+                )
+        if len(self.views) < 2:
+            raise PictureError(f"{len(self.views)} views of objects, expected at least two")
 
 
 def look_at(image: Path, *, views: Path | None = None, crops: Mapping[str, Crop] = {}) -> Seen:
@@ -77,8 +88,6 @@ def look_at(image: Path, *, views: Path | None = None, crops: Mapping[str, Crop]
         smaller = min(w, h) >= VIEW_SIZE
         how = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
         found[name] = cv2.resize(part, (VIEW_SIZE, VIEW_SIZE), interpolation=how)
-    if len(found) < 2:
-        raise PictureError(f"{image}: {len(found)} views of objects, expected at least two")
     return Seen(image=picture, views=found, crops=crops)
 
 

@@ -1,55 +1,48 @@
 """The planner rerun with and without a checkpoint's guidance, paired, into rows.
 
-How the comparison stays honest:
-
-- Paired: each task is planned unguided and with every guide, one right after the other, the
-  order rotated from task to task, so that a warm cache or a busy machine favours nobody.
-- All of it counts: guided time includes the network and every fallback. The scene is encoded
-  anew in each guided run, as though its goal came alone; `seconds_inference` says how much of
-  the time that was. The picture itself is the camera's work and is not timed.
-- CPU time (`time.process_time`, all threads), so that a shared machine does not blur it.
-- Misses stay in: a task that `prune` fails and the unguided planner solves is a row.
-- The replay of a plan is on neither side: both would pay the same for it.
+How each task is timed is told in `pairing`. Misses stay in: a task that `prune` fails and the
+unguided planner solves is a row. Beside the checkpoint other priors guide the same runs, true
+labels above all: what they save is what there is to win.
 """
 
 from __future__ import annotations
 
-import time
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field, model_validator
 
 from relevance.configs import config, identity_hash
+from relevance.evaluation.pairing import Asked, side_by_side
 from relevance.evaluation.predictions import Progress
+from relevance.evaluation.priors import PRIORS, TRUE, prior_scorer
 from relevance.evaluation.scorer import NetworkScorer, load_scorer
 from relevance.hashing import content_hash
-from relevance.planner import (
-    GUIDES,
-    PLANNER_VERSION,
-    Guide,
-    PlannerConfig,
-    PlanResult,
-    Scorer,
-    plan,
-)
+from relevance.planner import GUIDES, PLANNER_VERSION, PlannerConfig, Scorer
 from relevance.scene import PREDICATES, Goal, Scene
 from relevance.store import Dataset
 
-EVALUATION_VERSION = "2"
+EVALUATION_VERSION = "3"
 """Raised when rows of equal settings would come out otherwise."""
+OWN = "checkpoint"
+"""What rows call the prior that is the checkpoint itself."""
 
 
 @config
 class EvaluationConfig:
     """What to rerun, and how often."""
 
-    guides: Annotated[tuple[str, ...], Field(min_length=1)] = ("prune", "prune-then-full")
+    guides: Annotated[tuple[str, ...], Field(min_length=1)] = (
+        "prune", "prune-then-full", "order", "lazy",
+    )  # fmt: skip
     """Names of guides; the first is also rerun at `betas`."""
+    priors: tuple[str, ...] = (TRUE,)
+    """Who else gives scores to every guide: true, all, none, random, distance, swept, or another
+    checkpoint (a file, or one that comes with the package)."""
+    suite: str = ""
+    """What the tasks are of, where that is not the dataset's own test."""
     beta: float = 0.0
     """The working point: an object is kept iff score > -beta."""
     betas: tuple[float, ...] = (-2.0, 2.0, 4.0)
@@ -72,7 +65,9 @@ class EvaluationConfig:
         for guide in self.guides:
             if guide not in allowed:
                 raise ValueError(f"unknown guide {guide!r}, expected one of {', '.join(allowed)}")
-        for name in ("guides", "searches", "betas"):
+        if OWN in self.priors:
+            raise ValueError(f"priors {self.priors}: {OWN} is the one that is evaluated")
+        for name in ("guides", "searches", "betas", "priors"):
             given = getattr(self, name)
             if len(set(given)) != len(given):
                 raise ValueError(f"{name} {given}: expected distinct ones")
@@ -109,6 +104,8 @@ class Task:
     goal: Goal
     nth: int
     """Its place among the tasks of its predicate and family, from 1."""
+    moved: tuple[str, ...] = ()
+    """What the stored plan moves; nothing where there is none that holds."""
 
 
 def choose_tasks(
@@ -122,7 +119,9 @@ def choose_tasks(
     with dataset.connect() as connection:
         rows = connection.execute(
             """
-            select plan_id, scene_id, shard, predicate, subject, reference, nth from (
+            select plan_id, scene_id, shard, predicate, subject, reference, nth,
+                if(holds, moved, []) as moved
+            from (
                 select *, row_number() over (
                     partition by family, predicate order by md5(plan_id)) as nth
                 from plans left join shard_families using (split, shard) where split = $1)
@@ -138,8 +137,9 @@ def choose_tasks(
             shard=shard,
             goal=Goal(predicate=PREDICATES[predicate], subject=subject, reference=reference),
             nth=nth,
+            moved=tuple(moved),
         )
-        for plan_id, scene_id, shard, predicate, subject, reference, nth in rows
+        for plan_id, scene_id, shard, predicate, subject, reference, nth, moved in rows
     ]
 
 
@@ -170,7 +170,8 @@ def evaluate(
     total, done, count = sum(map(len, tasks.values())), 0, 0
     for shard, chosen in tasks.items():
         where = {"name": scorer.checkpoint_id, "split": config.split, "shard": shard}
-        made_by = content_hash([hash_of(config), [task.plan_id for task in chosen]])
+        asked = [hash_of(config), scorer.patience, [task.plan_id for task in chosen]]
+        made_by = content_hash(asked)
         file = dataset.shard_path("evaluations", **where)
         if file.is_file() and dataset.metadata(file).get("made_by") == made_by:
             done, count = done + len(chosen), count + dataset.read_file(file).num_rows
@@ -202,41 +203,25 @@ def _reruns(
     made = {
         "checkpoint_id": scorer.checkpoint_id,
         "split": config.split,
+        "suite": config.suite or None,
         "config_hash": hash_of(config),
     }
+    others = {name: prior_scorer(name) for name in config.priors}
     warm = False
     for sample in dataset.samples(config.split, [shard]) if tasks else ():
         for task in tasks:
             if task.scene_id != sample.scene.id:
                 continue
-            scorer.observe(sample.scene, sample.image, sample.views)
+            for each in (scorer, *others.values()):
+                if isinstance(each, NetworkScorer):
+                    each.observe(sample.scene, sample.image, sample.views)
+            given = {"moved": task.moved, "others": others}
             if not warm:  # first calls load compiled code; nobody's time should hold that
-                compare(sample.scene, task.goal, scorer, config)
+                compare(sample.scene, task.goal, scorer, config, **given)
                 warm = True
-            swept = task.nth <= config.sweep_tasks
-            rows = compare(sample.scene, task.goal, scorer, config, swept=swept, turn=task.nth)
+            given |= {"swept": task.nth <= config.sweep_tasks, "turn": task.nth}
+            rows = compare(sample.scene, task.goal, scorer, config, **given)
             yield [row | made for row in rows]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Run:
-    """One timed call of the planner."""
-
-    result: PlanResult
-    seconds: float
-    inference: float
-
-    @property
-    def solved(self) -> bool:
-        return self.result.status == "solved" and self.result.check_ok
-
-    @property
-    def length(self) -> int | None:
-        return len(self.result.actions) if self.solved else None
-
-    @property
-    def nlps(self) -> int:
-        return self.result.counts.keyframe + self.result.counts.path
 
 
 def compare(
@@ -245,66 +230,38 @@ def compare(
     scorer: Scorer,
     config: EvaluationConfig,
     *,
+    moved: Collection[str] = (),
+    others: Mapping[str, Scorer] = {},
     swept: bool = False,
     turn: int = 0,
 ) -> list[dict[str, Any]]:
-    """Plan one task unguided and with each guide; one row a search, guide and beta.
+    """Plan one task unguided and with each guide; one row a search, guide, beta and prior.
 
-    `turn` rotates who goes first; further betas are rerun, with the first search, if `swept`.
-    Rows lack checkpoint_id, split and config_hash.
+    `moved` is what a known plan moves, `others` are scorers of the config's priors that are there
+    already; `turn` rotates who goes first; further betas are rerun, with the first search, if
+    `swept`. Rows lack checkpoint_id, split, suite and config_hash.
     """
-    scores, rows = scorer.scores(scene, goal), []
+    priors: dict[str, Scorer] = {OWN: scorer}
+    for name in config.priors:
+        known = others.get(name) if name not in PRIORS else None  # those may need what is moved
+        priors[name] = known or prior_scorer(name, moved)
+    scores = {name: prior.scores(scene, goal) for name, prior in priors.items()}
+    rows = []
     for search in config.searches:
-        guides = [(guide, config.beta) for guide in config.guides]
+        settings = [(OWN, guide, config.beta) for guide in config.guides]
         if swept and search == config.searches[0]:
-            guides += [(config.guides[0], beta) for beta in config.betas]
-        runs: list[tuple[str, float] | None] = [None, *dict.fromkeys(guides)]
+            settings += [(OWN, config.guides[0], beta) for beta in config.betas]
+        settings += [
+            (name, guide, config.beta) for name in config.priors for guide in config.guides
+        ]
+        asked = [
+            Asked(prior=name, scorer=priors[name], mode=guide, beta=beta)
+            for name, guide, beta in dict.fromkeys(settings)
+        ]
         planner = replace(config.planner, search=search)
-        timed: dict[tuple[str, float] | None, list[_Run]] = defaultdict(list)
-        for repeat in range(config.repeats):
-            for position in range(len(runs)):
-                which = runs[(position + turn + repeat) % len(runs)]
-                guide = which and Guide(scorer=scorer, mode=which[0], beta=which[1])
-                timed[which].append(_timed(scene, goal, planner, guide))
-        unguided = timed.pop(None)
-        for which in runs[1:]:
-            assert which is not None
-            (guide, beta), guided = which, timed[which]
-            kept = {name for name, score in scores.items() if score > -beta}
-            rows.append(
-                {
-                    "guide": guide,
-                    "search": search,
-                    "beta": beta,
-                    "scene_id": scene.id,
-                    "predicate": goal.predicate.name,
-                    "subject": goal.subject,
-                    "reference": goal.reference,
-                    "n_objects": len(scene.objects),
-                    "solved_unguided": unguided[0].solved,
-                    "solved_guided": guided[0].solved,
-                    "seconds_unguided": float(np.median([run.seconds for run in unguided])),
-                    "seconds_guided": float(np.median([run.seconds for run in guided])),
-                    "seconds_inference": float(np.median([run.inference for run in guided])),
-                    "nodes_unguided": unguided[0].result.counts.nodes,
-                    "nodes_guided": guided[0].result.counts.nodes,
-                    "nlps_unguided": unguided[0].nlps,
-                    "nlps_guided": guided[0].nlps,
-                    "n_actions_unguided": unguided[0].length,
-                    "n_actions_guided": guided[0].length,
-                    "n_kept": len(kept | {goal.subject, goal.reference}),
-                    "planner_version": PLANNER_VERSION,
-                }
-            )
+        for pair in side_by_side(scene, goal, asked, planner, turn=turn, repeats=config.repeats):
+            beta = pair.asked.beta
+            kept = {name for name, score in scores[pair.asked.prior].items() if score > -beta}
+            kept |= {goal.subject, goal.reference}
+            rows.append({"search": search, **pair.row(scene, goal, len(kept))})
     return rows
-
-
-def _timed(scene: Scene, goal: Goal, planner: PlannerConfig, guide: Guide | None) -> _Run:
-    scorer = guide.scorer if guide else None
-    if isinstance(scorer, NetworkScorer):
-        scorer.forget()
-    start = time.process_time()
-    result = plan(scene, goal, config=planner, guide=guide, replay=False)
-    seconds = time.process_time() - start
-    inference = scorer.seconds if isinstance(scorer, NetworkScorer) else 0.0
-    return _Run(result=result, seconds=seconds, inference=inference)

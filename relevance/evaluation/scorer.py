@@ -19,8 +19,17 @@ from typing import Any
 import numpy as np
 
 from relevance.errors import RelevanceError, RelevanceWarning
-from relevance.networks import GraphNetwork, Network, named, read_checkpoint, true_geometry
-from relevance.planner import Guide
+from relevance.evaluation.calibration import Promise
+from relevance.networks import (
+    CHAMPION,
+    GraphNetwork,
+    Network,
+    find_checkpoint,
+    named,
+    read_checkpoint,
+    true_geometry,
+)
+from relevance.planner import GUIDES, PATIENCE, Guide, Scorer
 from relevance.sampling import same_view, view_of
 from relevance.scene import Goal, Predicate, Scene, lookalikes
 from relevance.store import Dataset
@@ -49,6 +58,7 @@ class NetworkScorer:
         policy: str = "found",
         offsets: Mapping[str, float] = {},
         yaws: Sequence[float] = (0.0,),
+        patience: int = PATIENCE,
         capacity: int = 64,
     ) -> None:
         self.model = model
@@ -60,9 +70,16 @@ class NetworkScorer:
         decides as validation chose."""
         self.yaws = tuple(yaws)
         """How the robots that it learned from were turned, rad."""
+        self.patience = patience
+        """Work after which a guide that waits should ask it, as validation chose."""
         self.capacity = capacity
+        self.promise: Promise | None = None
+        """A coverage, where it is asked for: its betas are then part of every score, so that
+        beta = 0 keeps what was promised."""
         self.seconds = 0.0
         """CPU seconds of the last `scores`, a needed encoding included, rendering left out."""
+        self.seconds_encoding = 0.0
+        """Part of them that all goals of the scene share; 0 where it was encoded already."""
         self._seen: OrderedDict[Hashable, tuple[np.ndarray, np.ndarray]] = OrderedDict()
         self._encodings: OrderedDict[Hashable, Any] = OrderedDict()
         self._warned: set[Hashable] = set()
@@ -91,7 +108,8 @@ class NetworkScorer:
 
     def offset(self, predicate: Predicate | str) -> float:
         """What a score has beyond the network's own logit."""
-        return self.offsets.get(str(predicate), 0.0)
+        promised = self.promise.beta(str(predicate)) if self.promise else 0.0
+        return self.offsets.get(str(predicate), 0.0) + promised
 
     def scores(self, scene: Scene, goal: Goal) -> dict[str, float]:
         """Score of every object of the scene."""
@@ -114,6 +132,7 @@ class NetworkScorer:
         if key not in self._encodings:
             poses = true_geometry(scene) if self.model.told else None
             self._keep(self._encodings, key, self.model.look(*self._seen[key], poses))
+        self.seconds_encoding = time.process_time() - start
         encoding = self._encodings[key]
         scores = np.empty((len(goals), len(scene.objects)))
         for predicate in dict.fromkeys(goal.predicate for goal in goals):
@@ -198,18 +217,24 @@ def open_checkpoint(checkpoint: str | Path) -> tuple[NetworkScorer, dict[str, An
         policy=policy_of(meta["config"]),
         offsets=meta.get("offsets", {}),
         yaws=meta.get("yaws", (0.0,)),
+        patience=meta.get("patience", PATIENCE),
     )
     return scorer, meta
 
 
-def load_scorer(checkpoint: str | Path, *, into: Dataset | None = None) -> NetworkScorer:
+def load_scorer(
+    checkpoint: str | Path, *, into: Dataset | None = None, coverage: float | None = None
+) -> NetworkScorer:
     """Read a checkpoint; CheckpointError names the file and the found and expected version.
 
-    `into` is a dataset that gets the checkpoint's row, where it has none yet.
+    `into` is a dataset that gets the checkpoint's row, where it has none yet; `coverage` is what
+    is promised of what scores over 0, see `Promise`.
     """
     scorer, meta = open_checkpoint(checkpoint)
     if into is not None:
         enter(into, checkpoint, meta)
+    if coverage is not None:
+        scorer.promise = Promise.of(meta, coverage)
     return scorer
 
 
@@ -217,7 +242,7 @@ def enter(dataset: Dataset, checkpoint: str | Path, meta: dict[str, Any]) -> Non
     """Give a dataset the row of a checkpoint, where it has none yet."""
     from relevance.training import write_row
 
-    write_row(dataset, Path(checkpoint), meta)
+    write_row(dataset, named(checkpoint), meta)
 
 
 def policy_of(config: dict[str, Any] | None) -> str:
@@ -231,9 +256,38 @@ def checkpoint_id(checkpoint: str | Path) -> str:
 
 
 def load_guide(
-    checkpoint: str | Path, *, mode: str = "prune-then-full", beta: float = 0.0
+    checkpoint: str | Path,
+    *,
+    mode: str = "prune-then-full",
+    beta: float = 0.0,
+    coverage: float | None = None,
+    dataset: str | Path | None = None,
 ) -> Guide:
-    """A guide for `plan` from a checkpoint file; EvaluationError unless beta is finite."""
+    """A guide for `plan` from a checkpoint file, a model's name, or a checkpoint of a dataset.
+
+    Of a `dataset` it may be an id or "champion". coverage: instead of a beta, with what probability
+    at least all relevant objects are kept (see `calibration`); for a calibrated checkpoint, and a
+    mode that goes by what is kept. Its patience is what `tune` chose for it, if it did. Raises
+    EvaluationError unless beta is finite, and where it is not said whose champion is meant.
+    """
     if not math.isfinite(beta):
         raise EvaluationError(f"beta: {beta}, expected a finite number")
-    return Guide(scorer=load_scorer(checkpoint), mode=mode, beta=beta)
+    if dataset is not None:
+        checkpoint = find_checkpoint(dataset, checkpoint)
+    elif str(checkpoint) == CHAMPION and not named(checkpoint).exists():
+        raise EvaluationError('load_guide("champion"): expected dataset=, whose champion it is')
+    if coverage is not None:
+        keeping = [n for n, kind in GUIDES.items() if kind.guided and kind.walk == "levels"]
+        if mode in GUIDES and mode not in keeping:
+            raise EvaluationError(
+                f"coverage: guide {mode} leaves nothing out, expected one of {', '.join(keeping)}"
+            )
+        if beta:
+            raise EvaluationError(f"coverage {coverage:g} and beta {beta:g}: expected one of them")
+    return guide_by(load_scorer(checkpoint, coverage=coverage), mode, beta)
+
+
+def guide_by(scorer: Scorer, mode: str, beta: float = 0.0) -> Guide:
+    """A guide that asks a scorer, with the scorer's own patience where it has one."""
+    patience = getattr(scorer, "patience", PATIENCE)
+    return Guide(scorer=scorer, mode=mode, beta=beta, patience=patience)

@@ -4,6 +4,18 @@ A checkpoint holds its weights once, and graphs for ONNX Runtime that have none:
 the weights when they are loaded, so that the two cannot drift apart.
 """
 
+from relevance.networks.champions import (
+    CHAMPION,
+    Event,
+    Record,
+    age,
+    crown,
+    find_checkpoint,
+    meant,
+    read_record,
+    roll_back,
+    settle,
+)
 from relevance.networks.files import (
     CHECKPOINT_VERSION,
     Checkpoint,
@@ -20,6 +32,7 @@ from relevance.networks.poses import ANGLES, DECIMETRE, GEOMETRY, true_geometry
 
 __all__ = [
     "ANGLES",
+    "CHAMPION",
     "CHECKPOINT_VERSION",
     "DECIMETRE",
     "GEOMETRY",
@@ -27,12 +40,21 @@ __all__ = [
     "WEIGHTS",
     "Checkpoint",
     "CheckpointError",
+    "Event",
     "GraphNetwork",
     "Network",
+    "Record",
+    "age",
+    "crown",
+    "find_checkpoint",
     "frame",
     "label",
+    "meant",
     "named",
     "read_checkpoint",
+    "read_record",
+    "roll_back",
+    "settle",
     "shipped",
     "true_geometry",
     "unframe",

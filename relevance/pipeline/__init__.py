@@ -4,7 +4,7 @@ from relevance.pipeline.doing import Made, do
 from relevance.pipeline.estimating import Estimate, Quantities, actual, estimate
 from relevance.pipeline.labelling import label_shard, labelled
 from relevance.pipeline.merging import merge
-from relevance.pipeline.preparing import append, describe, prepare
+from relevance.pipeline.preparing import append, describe, pending, prepare
 from relevance.pipeline.scenes import ATTEMPTS, draw, generate_shard, generated
 from relevance.pipeline.settings import (
     LAYOUT,
@@ -12,6 +12,7 @@ from relevance.pipeline.settings import (
     DatasetConfig,
     ShardReport,
     ShardSpec,
+    fitting_preset,
     load_config,
     shard_specs,
     shards_of,
@@ -48,6 +49,7 @@ __all__ = [
     "draw",
     "estimate",
     "finish",
+    "fitting_preset",
     "generate_shard",
     "generated",
     "integrity",
@@ -57,6 +59,7 @@ __all__ = [
     "load_config",
     "merge",
     "missing",
+    "pending",
     "prepare",
     "scenes_work",
     "shard_specs",

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError, field_validator
 
@@ -308,6 +308,17 @@ def load_config(dataset: Dataset) -> DatasetConfig:
 def read_config(dataset: Dataset, key: str, said: Mapping[str, Any]) -> DatasetConfig:
     """A config that is kept in dataset.json, younger settings having their defaults."""
     return _from_description(dataset, key, said, _CONFIG)
+
+
+def fitting_preset(train_scenes: int) -> Literal["smoke", "demo", "laptop", "paper"]:
+    """The preset of training that fits so many scenes: the largest whose dataset has at most twice
+    as many."""
+    presets = (DatasetConfig.paper(), DatasetConfig.laptop(), DatasetConfig.demo())
+    paper, laptop, demo = (
+        sum(preset.train.of(family) for family in FAMILIES) <= 2 * train_scenes
+        for preset in presets
+    )
+    return "paper" if paper else "laptop" if laptop else "demo" if demo else "smoke"
 
 
 def shards_of(dataset: Dataset) -> list[ShardSpec]:

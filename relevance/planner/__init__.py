@@ -1,7 +1,8 @@
 """Logic-Geometric Programming over pick and place: `plan(scene, goal)`."""
 
 from relevance.planner.checking import penetration
-from relevance.planner.guides import GUIDES, Guide, GuideError, Mode, Scorer
+from relevance.planner.guides import GUIDES, PATIENCE, Guide, GuideError, Mode, Scorer, ask
+from relevance.planner.moments import Moment, Motion
 from relevance.planner.rai.planner import Rai, RaiConfig
 from relevance.planner.result import (
     PLANNER_VERSION,
@@ -21,12 +22,15 @@ for _planner in (Ours(), Rai()):
 
 __all__ = [
     "GUIDES",
+    "PATIENCE",
     "PLANNERS",
     "PLANNER_VERSION",
     "Counts",
     "Guide",
     "GuideError",
     "Mode",
+    "Moment",
+    "Motion",
     "PlanResult",
     "Planner",
     "PlannerConfig",
@@ -34,6 +38,7 @@ __all__ = [
     "Scorer",
     "Seconds",
     "Status",
+    "ask",
     "penetration",
     "plan",
     "trajectory",

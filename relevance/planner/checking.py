@@ -11,11 +11,11 @@ from numba import njit
 from relevance.planner.grasps import Held, bodies
 from relevance.planner.kernels.kinematics import FRAME, look_at_frames
 from relevance.planner.kernels.motions import ALLOWED, dense_check
-from relevance.planner.path import Motion, put_down, upper_depth
+from relevance.planner.path import Motion, put_down, shoulder_depth, upper_depth
 from relevance.planner.problem import Problem
 from relevance.planner.result import PlanResult
 from relevance.robot import HAND, panda
-from relevance.scene import Box, Pose, Scene, goal_holds
+from relevance.scene import CONTACT_TOLERANCE, Box, Pose, Scene, goal_holds
 
 SLACK = 1e-6
 """What a limit may be exceeded by, relative to it or in rad: rounding."""
@@ -25,7 +25,8 @@ def broken(problem: Problem, motion: Motion) -> str:
     """What does not hold of a motion; empty if all does.
 
     Joint limits and speeds at every sub-step (joint angles are linear between rows, so the rows
-    say it all), penetration as the path bound measured it, and the goal at the end.
+    say it all), penetration as the path bound measured it, boxes put down on the table, and the
+    goal at the end.
     """
     arm = panda()
     for number, phase in enumerate(motion.phases):
@@ -36,8 +37,12 @@ def broken(problem: Problem, motion: Motion) -> str:
             return f"phase {number}: a joint moves at {speed:.2f} times its speed limit"
     if motion.max_penetration > ALLOWED:
         return f"something is penetrated by {1000 * motion.max_penetration:.1f} mm"
+    moved = {name: at_last(problem.boxes[name], pose) for name, pose in motion.final.items()}
+    for name, box in moved.items():
+        if box.on is None and (abs(box.corners()) > problem.table + CONTACT_TOLERANCE).any():
+            return f"{name} is not put on the table"
     ends = {problem.goal.subject, problem.goal.reference}
-    boxes = [at_last(problem.boxes[name], motion.final.get(name)) for name in ends]
+    boxes = [moved.get(name, problem.boxes[name]) for name in ends]
     if not goal_holds(boxes, problem.goal, problem.scene.robot):
         return f"the goal {problem.goal} is not true at the end"
     return ""
@@ -58,10 +63,8 @@ def extremes(q, dt, lower, upper, velocity):
     return joint, over, speed
 
 
-def at_last(box: Box, pose: Pose | None) -> Box:
+def at_last(box: Box, pose: Pose) -> Box:
     """The box where a plan leaves it."""
-    if pose is None:
-        return box
     return replace(box, position=pose.position, yaw=pose.yaw, on=pose.on)
 
 
@@ -87,6 +90,8 @@ def penetration(scene: Scene, result: PlanResult) -> float:
         margin, over = np.zeros((len(body.link), there.sum())), np.zeros((len(phase.q) - 1, 2))
         depth = dense_check(phase.q, problem.arm, body, obstacles[there], margin, over)
         worst = max(worst, depth, upper_depth(problem, phase.q, obstacles[there][:-2]))
+        if holding and held is not None:
+            worst = max(worst, shoulder_depth(problem, phase.q, phase.opening, held))
     return worst
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import product
 from typing import NamedTuple
 
@@ -66,7 +66,7 @@ class Grasp:
         return self.shift != 0 or self.tilt != 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Family:
     """Some grasps of a box side by side; each is made when it is first asked for."""
 
@@ -83,6 +83,13 @@ class Family:
     def wrists(self) -> np.ndarray:
         """(G, 2): `Grasp.wrist` of each."""
         return self.rows[:, WRIST_LEFT : WRIST_ABOVE + 1]
+
+    @cached_property
+    def levels(self) -> tuple[np.ndarray, np.ndarray]:
+        """The heights of the wrists over the box (L,), m, and which of them each grasp has (G,)."""
+        heights = self.rows[:, WRIST_ABOVE].tolist()
+        numbers = {height: number for number, height in enumerate(dict.fromkeys(heights))}
+        return np.array(list(numbers)), np.array([numbers[height] for height in heights])
 
     def __len__(self) -> int:
         return len(self.axes)

@@ -17,8 +17,9 @@ from relevance.errors import RelevanceError
 from relevance.registry import Registry
 from relevance.scene import Goal, Scene
 
-PATIENCE = 200
-"""Work before a guide that waits asks for scores, where its checkpoint names no other."""
+PATIENCE = 3_000
+"""Work before a guide that waits asks for scores, where its checkpoint names no other: about what a
+look costs, so that waiting in vain at most doubles it."""
 
 
 class GuideError(RelevanceError):
@@ -51,6 +52,11 @@ class Mode(ABC):
     counts, which need not be of least length."""
     waits: bool = False
     """Whether the search begins unguided and asks for scores only after the guide's patience."""
+
+    @property
+    def first(self) -> bool:
+        """Whether the first plan counts, whatever the settings say of when to stop."""
+        return self.walk == "likeliest"
 
     @abstractmethod
     def rounds(

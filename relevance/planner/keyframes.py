@@ -91,8 +91,10 @@ class Switches(NamedTuple):
     region: np.ndarray
     """(5,) goal region of the last box's centre: x, y, angle, half extents."""
     bounds: np.ndarray
-    """(m, 4): of |x| and |y| of each placement, and of the wrist's distance from the base (near,
-    far) so that the hand can rise from it."""
+    """(m, 4): of |x| and |y| of each placed box's corners, and of the wrist's distance from the
+    base (near, far) so that the hand can rise from it."""
+    footprint: np.ndarray
+    """(m, 2) half extents of each placed box along and across the finger axis."""
 
 
 class KeyframeBound:
@@ -126,7 +128,7 @@ class KeyframeBound:
         centre, half = np.zeros((2 * m, widest, 3)), np.zeros((2 * m, widest, 3))
         lean, radius = np.zeros((2 * m, widest)), np.zeros((2 * m, widest))
         pick, place_z, turn = np.zeros((m, TARGET)), np.zeros(m), np.zeros((m, 5))
-        bounds = np.zeros((m, 4))
+        bounds, footprint = np.zeros((m, 4)), np.zeros((m, 2))
         x = np.zeros(17 * m)
         p0, weight = np.zeros(3 * m), np.zeros(3 * m)
         reference = problem.reference
@@ -155,15 +157,13 @@ class KeyframeBound:
                 for row, value in zip(rows, body, strict=True):
                     row[k, :count] = value
                 stands[k, problem.index[name]] = False
-            c, s = abs(math.cos(place.pose[2])), abs(math.sin(place.pose[2]))
-            along, across = grasp.parts[0, 2], grasp.parts[0, 3]
+            footprint[j] = grasp.parts[0, 2:4]
             bounds[j, :2] = problem.table
-            bounds[j, :2] -= c * along + s * across, s * along + c * across
             bounds[j, 2:] = self.pose.interval(bottom, box, grasp)
         x[14 * m :] = p0
         switches = Switches(
             HOME, pick, place_z, turn, link, centre, half, lean, radius, n_bodies, obstacles,
-            stands, moved, supports, problem.goal_region(reference, *p0[-3:-1]), bounds,
+            stands, moved, supports, problem.goal_region(reference, *p0[-3:-1]), bounds, footprint,
         )  # fmt: skip
         start, elbow = x.copy(), x[2 : 14 * m : ARM]
         for swing, stay in product(SWINGS if every else SWINGS[:1], STAY):
@@ -360,7 +360,10 @@ def assemble(x, arm, switches, p0, weight, eq, ineq, limit, edge, mu, gain, H, g
                 value = row[0] * (x[at] - region[0]) + row[1] * (x[at + 1] - region[1]) - bound
             elif side < 8:
                 row[0], row[1] = (sign, 0.0) if side < 6 else (0.0, sign)
-                bound = switches.bounds[j, 0 if side < 6 else 1]
+                along = switches.footprint[j, 0 if side < 6 else 1]
+                across = switches.footprint[j, 1 if side < 6 else 0]
+                bound = switches.bounds[j, 0 if side < 6 else 1] - abs(c) * along - abs(s) * across
+                row[2] = math.copysign(c, c * s) * across - math.copysign(s, c * s) * along
                 value = row[0] * x[at] + row[1] * x[at + 1] - bound
             else:
                 row[0], row[1] = sign * ox / distance, sign * oy / distance

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from relevance.planner.grasps import (
+    Bodies,
     Held,
     bodies,
     carried,
@@ -45,6 +46,10 @@ class Motion:
     """Squared joint accelerations, summed over rows, and the prices of the holds, rad^2."""
     max_penetration: float
     """Deepest penetration at the sub-steps of the dense check, m."""
+
+
+_NONE = (-1.0, 0.0, 0.0)
+"""Of a leg that has no motion."""
 
 
 class _Leg(NamedTuple):
@@ -169,9 +174,20 @@ class PathBound:
         return found
 
     def _motion(self, leg: _Leg) -> tuple[float, float, float]:
+        """`motion`; once more around the robot's shoulder, where what is carried meets it."""
+        found = self._clear(leg, leg.obstacles)
+        if leg.held is None or found[0] < 0:
+            return found
+        depth = shoulder_depth(self.problem, leg.X, leg.opening, leg.held)
+        if depth > ALLOWED:
+            found = self._clear(leg, np.concatenate([self.problem.pillar, leg.obstacles]))
+            depth = shoulder_depth(self.problem, leg.X, leg.opening, leg.held)
+        return (max(found[0], depth), *found[1:]) if found[0] >= 0 and depth <= ALLOWED else _NONE
+
+    def _clear(self, leg: _Leg, obstacles: np.ndarray) -> tuple[float, float, float]:
         """`motion`; among tall things once more with every link, where it brings one too near."""
         problem, ends = self.problem, (leg.leave, leg.leaving, leg.arrive)
-        found = motion(leg.X, problem.arm, *ends, bodies(leg.opening, leg.held), leg.obstacles)
+        found = motion(leg.X, problem.arm, *ends, bodies(leg.opening, leg.held), obstacles)
         if found[0] < 0:
             return found
         upper = upper_depth(problem, leg.X, leg.obstacles[:-2])
@@ -199,6 +215,18 @@ def upper_depth(problem: Problem, X: np.ndarray, boxes: np.ndarray) -> float:
     upper = upper_bodies()
     margin, broken = np.zeros((len(upper.link), len(boxes))), np.zeros((len(X) - 1, 2))
     return dense_check(X, problem.whole_arm, upper, boxes, margin, broken)
+
+
+def shoulder_depth(problem: Problem, X: np.ndarray, opening: float, held: Held) -> float:
+    """How deep what is carried is in the robot's shoulder along the rows X, m.
+
+    Both turn with joint 1: where that is left at 0, the shoulder stands still.
+    """
+    body = Bodies(*(part[-1:] for part in bodies(opening, held)))
+    still = X.copy()
+    still[:, 0] = 0.0
+    margin, over = np.zeros((1, 1)), np.zeros((len(X) - 1, 2))
+    return dense_check(still, problem.arm, body, problem.shoulder, margin, over)
 
 
 def put_down(row: np.ndarray, position: tuple[float, float, float], yaw: float) -> None:

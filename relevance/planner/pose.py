@@ -35,7 +35,7 @@ from relevance.planner.kernels.planar import (
 )
 from relevance.planner.problem import CLOSE, Problem, obstacle
 from relevance.scene import Box
-from relevance.scene.geometry import UPRIGHT
+from relevance.scene.geometry import UPRIGHT, packed
 
 LIFT = 0.08
 """Height by which a grasped box must be liftable within reach, m."""
@@ -70,11 +70,16 @@ class _Blocked(NamedTuple):
     who: list[frozenset[str] | None]
     """None: out of reach."""
     sets: frozenset[frozenset[str]]
+    found: dict[frozenset[str], tuple[Grasp, ...]]
+    """What `free` has answered."""
 
     def free(self, gone: frozenset[str]) -> tuple[Grasp, ...]:
         """The grasps that are free once these have left."""
-        numbers = enumerate(self.who)
-        return tuple(self.family[g] for g, who in numbers if who is not None and who <= gone)
+        if gone not in self.found:
+            able = {who for who in self.sets if who <= gone}
+            numbers = enumerate(self.who) if able else ()
+            self.found[gone] = tuple(self.family[g] for g, who in numbers if who in able)
+        return self.found[gone]
 
 
 class PoseBound:
@@ -110,9 +115,9 @@ class PoseBound:
         for family in FAMILIES:
             parts = self._blockers(name, family).family.parts
             if len(parts):
-                x, y, along, across = np.moveaxis(abs(parts[..., :4]), -1, 0)
-                outer = np.hypot(x + along, y + across).max(0)
-                found.append(np.column_stack([outer, parts[..., 4].min(0)]))
+                size = abs(parts)
+                x, y = size[..., 0] + size[..., 2], size[..., 1] + size[..., 3]
+                found.append(np.array([np.hypot(x, y).max(0), parts[..., 4].min(0)]).T)
         return np.concatenate(found)
 
     def pickable(self, name: str, gone: frozenset[str]) -> bool:
@@ -254,7 +259,7 @@ class PoseBound:
         i, count = problem.index[name], len(problem.boxes)
         spare = self._spare_reach(problem.boxes[name], family)
         if not (spare >= -CLOSE).any():
-            return _Blocked(family, [None] * len(family), frozenset())
+            return _Blocked(family, [None] * len(family), frozenset(), {})
         blocking = np.zeros((len(family), count), np.bool_)
         boxes, names, seen = problem.obstacles[:count], list(problem.boxes), {}
 
@@ -262,10 +267,11 @@ class PoseBound:
             room = PICK_MARGIN - ease
             close = pick_blockers(i, family.axes, family.parts, boxes, room, blocking)
             who = list[frozenset[str] | None]()
+            rows = blocking.tobytes()
             for g, within in enumerate((spare >= -ease).tolist()):
-                bits = blocking[g].tobytes()
+                bits = rows[g * count : (g + 1) * count]
                 if within and bits not in seen:
-                    seen[bits] = frozenset(compress(names, blocking[g].tolist()))
+                    seen[bits] = frozenset(compress(names, bits))
                 who.append(seen[bits] if within else None)
             return who, close
 
@@ -278,7 +284,7 @@ class PoseBound:
             more, less = self._close.setdefault(name, (before, set(before)))
             more.update(one for one in blockers(-CLOSE)[0] if one is not None)
             less.update(one for one in blockers(CLOSE)[0] if one is not None)
-        return _Blocked(family, who, sets)
+        return _Blocked(family, who, sets, {})
 
     def _spare_reach(self, box: Box, family: Family) -> np.ndarray:
         """By how much each grasp is within reach where the box stands, (G,), m."""
@@ -289,8 +295,9 @@ class PoseBound:
         r = np.hypot(
             box.position[0] - x - left * np.sin(angles), box.position[1] - y + left * np.cos(angles)
         )
-        heights = (box.bottom + box.size[2] / 2 + family.wrists[:, 1]).tolist()
-        near, far = np.array([self._interval(height) for height in heights]).T
+        levels, which = family.levels
+        heights = (box.bottom + box.size[2] / 2 + levels).tolist()
+        near, far = np.array([self._interval(height) for height in heights]).T[:, which]
         return np.minimum(r - near, far - r)
 
     def _find(
@@ -478,7 +485,7 @@ class PoseBound:
             if found is None:
                 return None
             placed.append(found)
-            landed = np.vstack([landed, obstacle(moved_box(box, found))])
+            landed = np.vstack([landed, packed(box.size, *_put(box, found))])
         return placed
 
     def _later_picks(self, names: tuple[str, ...]) -> list[np.ndarray]:
@@ -498,9 +505,14 @@ def _wrapped(angle: float) -> float:
 
 def moved_box(box: Box, place: Placement) -> Box:
     """The box where it was put on the table."""
+    position, yaw = _put(box, place)
+    return replace(box, position=position, yaw=yaw, on=None)
+
+
+def _put(box: Box, place: Placement) -> tuple[tuple[float, float, float], float]:
+    """Position (m) and yaw (rad) of a box that is put on the table."""
     x, y, angle = place.pose
-    yaw = angle - place.grasp.axis * math.pi / 2
-    return replace(box, position=(x, y, box.size[2] / 2), yaw=yaw, on=None)
+    return (x, y, box.size[2] / 2), angle - place.grasp.axis * math.pi / 2
 
 
 def _side(grasp: Grasp, turn: int = 0) -> tuple[float, float]:

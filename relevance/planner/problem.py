@@ -94,13 +94,28 @@ class Problem:
 
     def _fixtures(self) -> list[np.ndarray]:
         """What always stands there, as obstacles: the table and the robot's foot."""
-        table, foot = np.empty(UPRIGHT), np.empty(UPRIGHT)
+        table = np.empty(UPRIGHT)
         upright(0.0, 0.0, -0.05, 0.0, self.table[0], self.table[1], 0.05, table)
-        (x, y, z), (hx, hy, hz) = panda().foot
-        bx, by, bz, yaw = self.arm.base
+        return [table, self._of_robot(*panda().foot)]
+
+    @cached_property
+    def shoulder(self) -> np.ndarray:
+        """(1, UPRIGHT): the arm's first link, where joint 1 is at 0."""
+        return self._of_robot(*panda().shoulder)[None]
+
+    @cached_property
+    def pillar(self) -> np.ndarray:
+        """(1, UPRIGHT): about what the first link fills, wherever joint 1 is."""
+        (_, _, z), (_, across, high) = panda().shoulder
+        return self._of_robot(np.array([0.0, 0.0, z]), np.array([across, across, high]))[None]
+
+    def _of_robot(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """A box of the base's frame as an obstacle."""
+        row, (bx, by, bz, yaw) = np.empty(UPRIGHT), self.arm.base
+        (x, y, z), (hx, hy, hz) = centre, half
         c, s = math.cos(yaw), math.sin(yaw)
-        upright(bx + c * x - s * y, by + s * x + c * y, bz + z, yaw, hx, hy, hz, foot)
-        return [table, foot]
+        upright(bx + c * x - s * y, by + s * x + c * y, bz + z, yaw, hx, hy, hz, row)
+        return row
 
     def standing(self, gone: Collection[str]) -> np.ndarray:
         """The boxes that have not gone, as obstacles."""

@@ -21,7 +21,7 @@ from relevance.scene import Action, Goal, Phase, Pose, Scene, SceneError
 if TYPE_CHECKING:  # it imports pybullet, which planning does without
     from relevance.simulation import Replay
 
-PLANNER_VERSION = "8"
+PLANNER_VERSION = "9"
 Status = Literal["solved", "infeasible", "limit", "refused"]
 """`refused`: a plan was found, and the replay in the simulator does not confirm it."""
 

@@ -10,6 +10,7 @@ from relevance.evaluation import (
     in_group,
     left_out,
     read_evaluations,
+    rerun_priors,
     settings,
     shown_as,
     summarise,
@@ -24,6 +25,7 @@ from relevance.store import Dataset
 def guided_section(dataset: Dataset, chosen: str | None) -> dict[str, Any]:
     """Comparisons by search and guide, the sweep over beta, and the tasks that were missed."""
     by_setting = settings(read_evaluations(dataset, chosen)) if chosen else {}
+    others = _other_priors(dataset, chosen) if chosen else []
     found: dict[str, Any] = {"searches": [], "misses": [], "n_tasks": 0}
     found["notes"] = left_out(dataset, chosen) if chosen else []
     searches = sorted({search for search, _, _ in by_setting}, reverse=True)  # tree first
@@ -32,12 +34,23 @@ def guided_section(dataset: Dataset, chosen: str | None) -> dict[str, Any]:
         working: dict[str, list[dict[str, Any]]] = {}
         for guide, beta in sorted(of_search, key=lambda key: (-len(of_search[key]), abs(key[1]))):
             working.setdefault(guide, of_search[guide, beta])
-        found["searches"].append(_search(search, working, of_search))
+        shown = _search(search, working, of_search)
+        shown["others"] = [other for other in others if other.search == search]
+        found["searches"].append(shown)
         if search == searches[0]:
             misses = [_missed(rows) for rows in working.values()]
             found["misses"] = max(misses, key=len)
         found["n_tasks"] += max(map(len, working.values()))
     return found
+
+
+def _other_priors(dataset: Dataset, chosen: str) -> list[Comparison]:
+    """What others than the checkpoint save with the same guides, over all tasks."""
+    return [
+        summarise(rows)
+        for prior in rerun_priors(dataset, chosen)
+        for rows in settings(read_evaluations(dataset, chosen, prior)).values()
+    ]
 
 
 def _missed(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -10,13 +10,22 @@ import numpy as np
 
 from relevance.evaluation import (
     BREAKDOWNS,
+    LEVELS,
+    Calibration,
     accuracy_table,
     breakdown_table,
+    covered,
+    out_of_reach,
     read_predictions,
     unjudged,
 )
+from relevance.networks import CheckpointError, read_checkpoint
 from relevance.report import plots
+from relevance.report.style import GROUPS
 from relevance.store import Dataset
+
+PROMISED = tuple(sorted({*LEVELS, *np.round(np.arange(0.5, 0.9951, 0.005), 3).tolist()}))
+"""Coverages at which curves are drawn."""
 
 
 def network_section(
@@ -31,10 +40,13 @@ def network_section(
         "with_goal_objects": [],
         "offsets": {},
         "n_tasks": 0,
+        "coverage": [],
+        "out_of_reach": [],
         "plots": {},
         "notes": unjudged(dataset, chosen) if chosen else [],
     }
-    history = _history(dataset, model["chosen"])
+    meta = _meta(dataset, model["chosen"])
+    history = meta.get("history", [])
     if history:
         model["plots"]["training"] = plots.svg("training", plots.training_curve, history=history)
     everything = read_predictions(dataset, chosen or "")
@@ -63,16 +75,28 @@ def network_section(
             "scores", plots.scores, size=(9.2, 2.7), panels=panels, predictions=predictions
         ),
     }
+    calibration = Calibration.of(meta)
+    if calibration is not None:
+        model["coverage"] = covered(everything, calibration)
+        model["out_of_reach"] = out_of_reach(everything, calibration)
+        curves = [r for r in covered(everything, calibration, levels=PROMISED) if r.group in GROUPS]
+        if curves:
+            model["plots"]["coverage"] = plots.svg(
+                "coverage", plots.coverage, size=(9.2, 3.1), panels=2, rows=curves
+            )
     return model
 
 
-def _history(dataset: Dataset, chosen: Mapping[str, Any] | None) -> list[dict[str, float]]:
-    """The training curve that the checkpoint's file holds; empty without the file."""
-    from relevance.training import CheckpointError, load_checkpoint  # torch: only for this curve
+def training_history(dataset: Dataset, chosen: Mapping[str, Any] | None) -> list[dict[str, float]]:
+    """The training curve that a checkpoint's file holds; empty without the file."""
+    return _meta(dataset, chosen).get("history", [])
 
+
+def _meta(dataset: Dataset, chosen: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What the checkpoint's file says of it (curve, calibration); nothing without the file."""
     if chosen is None:
-        return []
+        return {}
     try:
-        return load_checkpoint(dataset.path / chosen["path"])[1].get("history", [])
+        return read_checkpoint(dataset.path / chosen["path"]).meta
     except CheckpointError:  # a dataset may travel without its weights
-        return []
+        return {}

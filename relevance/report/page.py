@@ -18,6 +18,7 @@ from markupsafe import Markup
 
 from relevance.evaluation import NETWORK, RULE, policy_of_checkpoint
 from relevance.metrics import Interval
+from relevance.networks import read_record
 from relevance.report import style
 from relevance.report.data import data_section, planner_section
 from relevance.report.gallery import Rows, choose_examples, draw_examples
@@ -37,7 +38,7 @@ def build(
 ) -> Path:
     """Write the report of a dataset to `out` (default ROOT/report.html) and return its path.
 
-    `checkpoint_id` defaults to the newest checkpoint that was evaluated, else the newest;
+    `checkpoint_id` defaults to the champion, without one to the newest that was evaluated;
     `examples` is the number of example scenes a predicate. Raises DatasetError for a folder
     that is no dataset and for an unknown checkpoint.
     """
@@ -141,6 +142,8 @@ def _choose(
                 f"expected one of {', '.join(known) or 'none: nothing was trained yet'}"
             )
         return wanted
+    if (champion := read_record(dataset).champion) in known:
+        return champion
     for column in ("n_evaluations", "n_predictions"):
         for row in checkpoints:
             if row[column]:

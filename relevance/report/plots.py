@@ -11,7 +11,7 @@ import re
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
@@ -20,7 +20,6 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from relevance.evaluation import Comparison, Predictions, guided_cost
 from relevance.metrics import mean_interval
 from relevance.report.paper import paper
 from relevance.report.style import (
@@ -42,6 +41,9 @@ from relevance.report.style import (
     seconds,
 )
 from relevance.report.style import groups as shown_groups
+
+if TYPE_CHECKING:  # the planner comes with it, of which most plots know nothing
+    from relevance.evaluation import Comparison, Covered, Predictions
 
 QUANTILES = np.linspace(0, 1, 201)
 """Shares at which distributions of times are drawn; the middle one is the median."""
@@ -209,6 +211,35 @@ def beta_accuracy(*axes: Axes, predictions: Predictions) -> None:
     max(axes, key=lambda ax: len(ax.lines)).legend(loc="lower left")
 
 
+def coverage(*axes: Axes, rows: Sequence[Covered]) -> None:
+    """What was promised against what was reached, and against how much is kept for it."""
+    from relevance.evaluation import LEVELS
+
+    reached_ax, kept_ax = axes
+    for number, group in enumerate(dict.fromkeys(row.group for row in rows)):
+        found, color = [row for row in rows if row.group == group], family_color(group)
+        promised = [row.coverage for row in found]
+        label = f"{group} (n = {found[0].reached.n} scenes)"
+        reached_ax.plot(promised, [row.reached_all for row in found], color=color, label=label)
+        for row in found:
+            if row.coverage in LEVELS:
+                low, value, high = row.reached.low, row.reached.value, row.reached.high
+                at, spread = row.coverage + 0.003 * number, [[value - low], [high - value]]
+                style = {"fmt": "o", "markersize": 4, "linewidth": 1, "capsize": 2.5}
+                reached_ax.errorbar(at, value, spread, color=color, **style)
+        kept_ax.plot(promised, [row.kept / row.objects for row in found], color=color)
+    ends = [min(row.coverage for row in rows), 1.0]
+    reached_ax.plot(ends, ends, ":", color=MUTED, linewidth=1.2, label="as promised")
+    reached_ax.set_title("goals with everything relevant kept")
+    reached_ax.legend(loc="lower right")
+    kept_ax.set_title("boxes that are kept, the goal's own included")
+    kept_ax.set_ylim(0, 1.02)
+    for ax in axes:
+        ax.set_xlabel("promised coverage")
+        _percent_axis(ax.xaxis)
+        _percent_axis(ax.yaxis)
+
+
 def scores(*axes: Axes, predictions: Predictions) -> None:
     for ax, group in zip(axes, families_in(predictions), strict=True):
         part = predictions.of(group)
@@ -257,6 +288,8 @@ def runtimes(*axes: Axes, comparisons: dict[str, list[Comparison]]) -> None:
 
 def by_objects(ax: Axes, rows: dict[str, list[dict[str, Any]]]) -> None:
     """Mean CPU time by the number of objects, with intervals; `rows` per guide, solvable tasks."""
+    from relevance.evaluation import guided_cost
+
     first = next(iter(rows.values()))
     series = {UNGUIDED: (first, lambda row: row["seconds_unguided"])}
     series |= {guide: (chosen, guided_cost) for guide, chosen in rows.items()}

@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from relevance.planner import GUIDES
 from relevance.scene import FAMILIES, PREDICATES, group_of
 
 GROUPS = FAMILIES
@@ -51,6 +50,8 @@ class GuideStyle:
 
 def guide_style(name: str) -> GuideStyle:
     """How a guide is shown; one that nobody knows (any more) gets a colour by its name."""
+    from relevance.planner import GUIDES  # and what it compiles: only where a guide is shown
+
     if name == UNGUIDED:
         name = "none"
     if name not in GUIDES:

@@ -24,8 +24,10 @@ from relevance.sampling.settings import (
     Randomisation,
     SceneConfig,
 )
+from relevance.sampling.tasks import ATTEMPTS, sample_task
 
 __all__ = [
+    "ATTEMPTS",
     "SAMPLER_VERSION",
     "GoalConfig",
     "Randomisation",
@@ -33,5 +35,6 @@ __all__ = [
     "same_view",
     "sample_goals",
     "sample_scene",
+    "sample_task",
     "view_of",
 ]

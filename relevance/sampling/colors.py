@@ -63,8 +63,10 @@ def draw_colors(
     *,
     distance: float,
     perceptual: bool = False,
+    saturation: tuple[float, float] = (0.55, 1.0),
+    brightness: tuple[float, float] = (0.4, 1.0),
 ) -> list[tuple[str, Color]] | None:
-    """Distinct saturated colours, each named after the nearest colour word not yet taken.
+    """Distinct colours, each named after the nearest colour word not yet taken.
 
     distance: the least to each other and to those to avoid, in RGB (0..1), or when `perceptual`
     as CIE 1976 Delta E. With n > 11 colours it shrinks by (11 / n)^(1/2). None when they could
@@ -75,7 +77,7 @@ def draw_colors(
     least = (distance * min(1.0, math.sqrt(FEW / count))) ** 2
     named: dict[str, Color] = {}
     for _ in range(200 * count):
-        color = from_hsv(rng.uniform(0, 1), rng.uniform(0.55, 1), rng.uniform(0.4, 1))
+        color = from_hsv(rng.uniform(0, 1), rng.uniform(*saturation), rng.uniform(*brightness))
         place = _place(color, perceptual)
         if min(_apart(place, other) for other in taken) < least:
             continue

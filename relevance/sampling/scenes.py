@@ -54,6 +54,8 @@ def sample_scene(
         [config.table.color, *([texture.color] if texture else [])],
         distance=ranges.color_delta_e if ranges else config.color_distance,
         perceptual=ranges is not None,
+        saturation=config.saturation,
+        brightness=config.brightness,
     )
     if colors is None:
         return None
@@ -62,15 +64,20 @@ def sample_scene(
         on_top = min(1 + int(rng.binomial(total - 1, config.stacking)), total // 2)
     standing = Standing(config)
     for i, (name, color) in enumerate(colors):
-        box = None
+        box, twin = None, None
+        if i and config.twins and rng.random() < config.twins:
+            twin = standing.boxes[int(rng.integers(i))]
+            color = twin.color
         if i >= total - on_top:
-            box = _stacked_box(rng, name, color, standing, config)
+            box = _stacked_box(rng, name, color, standing, config, twin)
         # One box stands on another; a further one that finds no place there goes to the table.
         if box is None and i != total - on_top:
-            box = _table_box(rng, name, color, standing, config)
+            box = _table_box(rng, name, color, standing, config, twin)
         if box is None:
             return None
         standing.add(box)
+    if config.occlusion and _hidden(standing) < config.occlusion:
+        return None
     # Crowded boxes come after their neighbours and the stacked ones come last: shuffled, so
     # that the order of objects tells nothing.
     objects = tuple(standing.boxes[i] for i in rng.permutation(total))
@@ -81,6 +88,12 @@ def sample_scene(
         light=config.light,
         robot=config.robot,
     )
+
+
+def _hidden(standing: Standing) -> float:
+    """Share of the boxes that others hide, mean over boxes, judged by rays."""
+    shown, n = standing._shown, len(standing.boxes)
+    return float((shown.shares[:n] * shown.hidden[:n]).sum() / n)
 
 
 def _size(
@@ -108,8 +121,10 @@ def _table_box(
     color: Color,
     standing: Standing,
     config: SceneConfig,
+    twin: Box | None,
 ) -> Box | None:
-    boxes, size = standing.boxes, _size(rng, config, config.obstacle_share, config.max_height)
+    boxes = standing.boxes
+    size = twin.size if twin else _size(rng, config, config.obstacle_share, config.max_height)
     crowding = config.crowding if config.family == "same-plane" else config.crowding_on
     crowd = bool(boxes) and rng.random() < crowding
     best, most, fitting = None, -1, 0
@@ -184,6 +199,7 @@ def _stacked_box(
     color: Color,
     standing: Standing,
     config: SceneConfig,
+    twin: Box | None,
 ) -> Box | None:
     """A box on one that carries none yet, its centre near the middle of the top face (`OVER`)."""
     taken = {box.on for box in standing.boxes}
@@ -200,7 +216,9 @@ def _stacked_box(
         i = free[int(rng.integers(len(free)))]
         carrier = standing.boxes[i]
         tallest = min(config.stack_height - carrier.top, config.max_height)
-        size = _size(rng, config, 0.0, tallest)
+        size = twin.size if twin else _size(rng, config, 0.0, tallest)
+        if size[2] > tallest:
+            continue
         yaw = float(rng.uniform(-math.pi / 2, math.pi / 2))
         c, s = math.cos(carrier.yaw), math.sin(carrier.yaw)
         over = OVER[config.family]

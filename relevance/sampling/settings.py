@@ -127,6 +127,14 @@ class SceneConfig:
     color_distance: Annotated[float, Field(gt=0, le=0.35)] = 0.3
     """Least RGB distance of two boxes, and of a box and the table; with n > 11 boxes it
     shrinks by (11 / n)^(1/2)."""
+    saturation: Annotated[Span, _span(0, 1)] = (0.55, 1.0)
+    """Saturation of the boxes' colours, from and to; any hue."""
+    brightness: Annotated[Span, _span(0, 1)] = (0.4, 1.0)
+    """Value of the boxes' colours (HSV), from and to."""
+    twins: Share = 0.0
+    """Share of the boxes that look like one before them, of its size and colour."""
+    occlusion: Share = 0.0
+    """Least share of the boxes that others hide, mean over boxes; a draw with less has failed."""
     tries: Annotated[int, Field(ge=1)] = 100
     """Positions tried for one box before the draw counts as failed."""
     randomisation: Randomisation | None = None

@@ -19,13 +19,12 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from types import TracebackType
 
 import numpy as np
 
-from relevance.scene import Box, Camera, Color, Light, Scene, Table, camera_up, pinhole
+from relevance.scene import Box, Camera, Color, Light, Scene, Table, pinhole
 from relevance.scene.geometry import packed, uprights
-from relevance.simulation.bullet import pybullet
+from relevance.simulation.bullet import Client, lens, pybullet
 from relevance.simulation.painting import SHADOWED, ground, halved, paint, pattern, silhouettes
 
 RENDERER_VERSION = "1"
@@ -73,41 +72,22 @@ class Rendering:
     """(N,) float64: those, as a share of the pixels that it would show if it were alone."""
 
 
-class Renderer:
+class Renderer(Client):
     """Renders scenes in a pybullet client of its own; use as a context manager.
 
     Equal scenes give equal pixels, whatever was rendered before and in which process.
     """
 
     def __init__(self) -> None:
-        self._client = pybullet.connect(pybullet.DIRECT)
-        if self._client < 0:
-            raise RuntimeError("pybullet gave no client: too many are open in this process")
+        super().__init__()
         self._views: OrderedDict[tuple, np.ndarray] = OrderedDict()
         self._table_colors: OrderedDict[tuple, np.ndarray] = OrderedDict()
-
-    def __enter__(self) -> Renderer:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Give the client back; the renderer cannot be used afterwards."""
-        if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
 
     def render(self, scene: Scene) -> Rendering:
         """Scene image, mask, canonical views and visibility of every object."""
         camera, light = scene.camera, scene.light
         shades = self._shades(scene)
-        pybullet.resetSimulation(physicsClientId=self._client)
+        pybullet.resetSimulation(physicsClientId=self.client)
         views = []
         for box in scene.objects:
             body = self._create(box)
@@ -145,13 +125,13 @@ class Renderer:
             halfExtents=[edge / 2 for edge in box.size],
             rgbaColor=[*box.color, 1.0],
             specularColor=[0.0, 0.0, 0.0],
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
         return pybullet.createMultiBody(
             baseMass=0.0,
             baseVisualShapeIndex=shape,
             useMaximalCoordinates=True,  # one rigid body without links, quicker to make
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
 
     def _put(self, body: int, position: Sequence[float], yaw: float) -> None:
@@ -159,7 +139,7 @@ class Renderer:
             body,
             position,
             (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
 
     def _picture(
@@ -175,14 +155,8 @@ class Renderer:
         if left >= right:  # no box is in the picture
             left, upper, right, lower = 0, 0, 1, 1
         wide, high = right - left, lower - upper
-        aspect = width / height
-        vertical = 2 * math.atan(math.tan(math.radians(camera.fov) / 2) / aspect)
-        # The frustum of the whole picture (column by column), cut down to the part.
-        frustum = list(
-            pybullet.computeProjectionMatrixFOV(
-                math.degrees(vertical), aspect, camera.near, camera.far
-            )
-        )
+        view, frustum = lens(camera)
+        frustum = [*frustum]  # of the whole picture, cut down to the part
         frustum[0] *= width / wide
         frustum[5] *= height / high
         frustum[8] = (left + right - width) / wide
@@ -190,7 +164,7 @@ class Renderer:
         _, _, rgba, _, bodies = pybullet.getCameraImage(
             wide,
             high,
-            pybullet.computeViewMatrix(camera.eye, camera.target, camera_up(camera)),
+            view,
             frustum,
             lightDirection=light.direction,
             lightColor=light.color,
@@ -200,7 +174,7 @@ class Renderer:
             lightDiffuseCoeff=light.diffuse,
             lightSpecularCoeff=light.specular,
             renderer=pybullet.ER_TINY_RENDERER,
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
         window = np.s_[upper:lower, left:right]
         whole = np.zeros((height, width, 4), dtype=np.uint8)
@@ -252,7 +226,7 @@ class Renderer:
         """
         key = (color, light)
         if key not in self._table_colors:
-            pybullet.resetSimulation(physicsClientId=self._client)
+            pybullet.resetSimulation(physicsClientId=self.client)
             # GEOM_PLANE has no visual; a mesh quad does.
             shape = pybullet.createVisualShape(
                 pybullet.GEOM_MESH,
@@ -262,10 +236,10 @@ class Renderer:
                 uvs=[[0, 0], [1, 0], [1, 1], [0, 1]],
                 rgbaColor=[*color, 1.0],
                 specularColor=[0.0, 0.0, 0.0],
-                physicsClientId=self._client,
+                physicsClientId=self.client,
             )
             pybullet.createMultiBody(
-                baseMass=0.0, baseVisualShapeIndex=shape, physicsClientId=self._client
+                baseMass=0.0, baseVisualShapeIndex=shape, physicsClientId=self.client
             )
             camera = Camera(eye=(-0.5, 0.0, 0.5), width=8, height=8, fov=10.0)
             lit = self._picture(camera, light)[0][4, 4, :3]

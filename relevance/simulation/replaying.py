@@ -25,7 +25,7 @@ import numpy as np
 from relevance.errors import RelevanceError
 from relevance.robot import panda_urdf
 from relevance.scene import CONTACT_TOLERANCE, Goal, Phase, Scene, goal_holds
-from relevance.simulation.bullet import pybullet
+from relevance.simulation.bullet import Client, pybullet
 
 MAX_PENETRATION = 1e-3
 """Deepest overlap that a replayed plan may have, m."""
@@ -78,13 +78,11 @@ class _Refused(Exception):
     """A plan does not hold; the message is the reason."""
 
 
-class _Arena:
+class _Arena(Client):
     """A pybullet client that holds the Panda and takes in one scene after another."""
 
     def __init__(self) -> None:
-        self.client = pybullet.connect(pybullet.DIRECT)
-        if self.client < 0:
-            raise RuntimeError("pybullet gave no client: too many are open in this process")
+        super().__init__()
         self.bodies: list[int] = []
         self._uses = 0
         self._load()

@@ -9,6 +9,7 @@ from relevance.store.exporting import export
 from relevance.store.files import SPLITS, Files, Source, differences
 from relevance.store.images import MEMBERS, VIEW_SIZE, Pictures, Sample, decode, undecoded
 from relevance.store.labellings import Labelling
+from relevance.store.needs import needs
 from relevance.store.parquet import empty_size
 from relevance.store.paths import (
     DatasetError,
@@ -60,6 +61,7 @@ __all__ = [
     "file_hash",
     "is_remote",
     "locate",
+    "needs",
     "polled",
     "replacing",
     "replanned",

@@ -13,15 +13,18 @@ What is unusual here:
   `on-the-left` and `on-the-right`, and exchanging colour channels changes no geometry.
 """
 
-from relevance.networks import CHECKPOINT_VERSION, CheckpointError, shipped
+from relevance.networks import (
+    CHECKPOINT_VERSION,
+    CheckpointError,
+    age,
+    find_checkpoint,
+    shipped,
+)
 from relevance.training.budget import one_core, steps_within
 from relevance.training.catalogue import Catalogue
 from relevance.training.checkpoints import (
-    age,
     checkpoint_id,
-    find_checkpoint,
     load_checkpoint,
-    newest_checkpoint,
     pick_device,
     save_checkpoint,
     write_row,
@@ -62,7 +65,6 @@ __all__ = [
     "load_checkpoint",
     "measure",
     "measure_speed",
-    "newest_checkpoint",
     "one_core",
     "pick_device",
     "polling",

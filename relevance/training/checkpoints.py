@@ -1,4 +1,4 @@
-"""Checkpoints as models: written with their graphs, read, entered in a dataset, and found.
+"""Checkpoints as models: written with their graphs, read, and entered in a dataset.
 
 The name of a file means nothing; its id is inside (`relevance.networks`).
 """
@@ -33,12 +33,11 @@ from relevance.networks import (
     frame,
     named,
     read_checkpoint,
-    shipped,
     unframe,
     write_checkpoint,
 )
 from relevance.scene import PREDICATES
-from relevance.store import Dataset, DatasetError
+from relevance.store import Dataset
 from relevance.training.settings import TrainConfig
 
 STATE_VERSION = 2
@@ -190,37 +189,3 @@ def write_row(dataset: Dataset, path: Path, meta: Mapping[str, Any]) -> None:
         "offsets": json.dumps(meta.get("offsets", {}), sort_keys=True),
     }
     dataset.write_rows("checkpoints", [row], name=meta["checkpoint_id"])
-
-
-def age(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """By what rows of `checkpoints` are ordered: when training ended, then the id."""
-    return row["created"], row["checkpoint_id"]
-
-
-def newest_checkpoint(root: str | Path) -> Path:
-    """The file of the dataset's checkpoint that was made last; DatasetError when there is none."""
-    dataset = Dataset.open(root)
-    rows = dataset.read_rows("checkpoints")
-    if not rows:
-        raise DatasetError(f"{dataset.path}: no checkpoints there, expected `train` first")
-    return dataset.path / max(rows, key=age)["path"]
-
-
-def find_checkpoint(root: str | Path, text: str | Path | None = None) -> Path:
-    """The file that is meant by an id of the dataset, a path, or nothing: then the newest.
-
-    Raises DatasetError with the ids that there are.
-    """
-    if text is None:
-        return newest_checkpoint(root)
-    dataset = Dataset.open(root)
-    rows = {row["checkpoint_id"]: row for row in dataset.read_rows("checkpoints")}
-    if str(text) in rows:
-        return dataset.path / rows[str(text)]["path"]
-    path = named(text)
-    if path.is_file():
-        return path
-    known = ", ".join([*rows, *shipped()]) or "none: nothing was trained yet"
-    raise DatasetError(
-        f"{dataset.path}: unknown checkpoint {str(text)!r}, expected a file or one of {known}"
-    )

@@ -33,7 +33,8 @@ def ship(
     """
     name = name or config.model.body
     model, meta = load_checkpoint(train(root, config, progress=progress), "cpu")
-    kept = {key: value for key, value in meta.items() if key != "history"}
+    # A calibration is of the very weights that it was made with, not of halved ones.
+    kept = {key: value for key, value in meta.items() if key not in ("history", "calibration")}
     path = Path(out) / f"{name}.pt"
     path.parent.mkdir(parents=True, exist_ok=True)
     save_checkpoint(path, model.half(), kept)

@@ -24,14 +24,13 @@ import torch
 from relevance.errors import RelevanceWarning
 from relevance.metrics import accuracy
 from relevance.models import RelevanceModel
-from relevance.networks import CheckpointError
+from relevance.networks import CheckpointError, find_checkpoint
 from relevance.scene import PREDICATES, Predicate, group_of
 from relevance.store import Dataset, DatasetError, locate
 from relevance.training.catalogue import Catalogue
 from relevance.training.checkpoints import (
     checkpoint_id,
     data_hash,
-    find_checkpoint,
     load_checkpoint,
     pick_device,
     read_file,

@@ -114,7 +114,7 @@ def assemble(
     With a gain above 0, the multipliers (eq, ineq, limit) are first moved along the violations.
     seen (S, 7), room (S, B): by how much each body was clear of everything at a configuration of
     each sample (m; 0 where it never was); it is not looked at again before it can have moved that
-    far from there. Returns (merit, violation) and fills band (n, 3 * ARM) as `banded_solve` wants
+    far from there. Returns (merit, violation) and fills band (n, WIDTH) as `banded_solve` wants
     it, g (n,).
     """
     T = len(X) - 1

@@ -11,8 +11,9 @@ STEP = 0.1
 """Shortest time between rows, s."""
 SPEED = 0.9
 """Share of the velocity limits that motions use."""
-WIDTH = 3 * ARM
-"""Entries below the diagonal that a banded system of rows has, itself included."""
+WIDTH = 2 * ARM + 1
+"""Entries below the diagonal that a banded system of rows has, itself included: rows next to each
+other share obstacles, and accelerations tie each joint to itself two rows on."""
 
 
 @njit(cache=True)
@@ -27,7 +28,7 @@ def assign(to, source):
 
 @njit(cache=True)
 def smoothness(T):
-    """Second derivative of half the squared accelerations, (n, 3 * ARM) as for `banded_solve`."""
+    """Second derivative of half the squared accelerations, (n, WIDTH) as for `banded_solve`."""
     band = np.zeros(((T - 1) * ARM, WIDTH))
     for t in range(T + 1):
         for i in range(ARM):

@@ -1,2 +1,0 @@
--- How planning ended, as far as it happened.
-SELECT DISTINCT status FROM plans ORDER BY status = 'solved' DESC, status;
