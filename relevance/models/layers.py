@@ -42,7 +42,7 @@ class Attention(nn.Module):
         self, x: Tensor, allowed: Tensor | None = None, between: Tensor | None = None
     ) -> Tensor:
         """x (B, L, D); allowed (B or 1, L, L) bool: row may look at column (None: at all); between
-        (B, L, L, E)."""
+        (B or C, L, L, E), each for B / C rows of x that follow each other."""
         if tracing() and allowed is None and between is None:
             x = x + self.out(attend(self.norm_in(x), self.qkv, self.heads))
             return x + self.mlp(self.norm_mid(x))
@@ -55,13 +55,17 @@ class Attention(nn.Module):
             x = x + self.out(seen.transpose(1, 2).reshape(batch, length, width))
             return x + self.mlp(self.norm_mid(x))
         logits = q @ k.transpose(2, 3) / math.sqrt(width // self.heads)
-        logits = logits + self.say(between).permute(0, 3, 1, 2)
+        scenes, each = len(between), batch // len(between)
+        say = self.say(between).permute(0, 3, 1, 2)  # (C, H, L, L)
+        logits = (logits.unflatten(0, (scenes, each)) + say[:, None]).flatten(0, 1)
         if mask is not None:
             logits = logits.masked_fill(~mask, -math.inf)
         share_BHLL = logits.softmax(-1)
         seen = (share_BHLL @ v).transpose(1, 2).reshape(batch, length, width)
-        carried = share_BHLL.transpose(1, 2) @ between  # (B, L, H, E)
-        x = x + self.out(seen) + self.carried(carried.flatten(2))
+        # What lies between is the same for all that ask: (C, L, B / C x H, L) @ (C, L, L, E).
+        by_row = share_BHLL.unflatten(0, (scenes, each)).permute(0, 3, 1, 2, 4).flatten(2, 3)
+        carried = (by_row @ between).unflatten(2, (each, self.heads)).permute(0, 2, 1, 3, 4)
+        x = x + self.out(seen) + self.carried(carried.flatten(0, 1).flatten(2))
         return x + self.mlp(self.norm_mid(x))
 
     def looks(self, x: Tensor, rows: slice, columns: slice) -> Tensor:

@@ -20,7 +20,7 @@ ROBOT = Robot()
 """Whose axes the directions of goals are: every picture was taken in front of this one."""
 GOAL_FEATURES = 3 * GEOMETRY + 2 + 2 * 8
 BETWEEN_FEATURES = 3 + ANGLES + 1 + 2
-BETWEEN = 32
+BETWEEN = 64
 """Width of what lies between two objects."""
 
 
@@ -80,8 +80,6 @@ class Reasoning(nn.Module):
         x_BGND = tokens[:, None] + self.place(features) + self.predicate[predicate.name]
         x = x_BGND[0] if tracing() else x_BGND.flatten(0, 1)
         allowed, between = columns(present), self.between(geometry)
-        if not tracing():
-            between = between.repeat_interleave(goals.shape[1], dim=0)
         if allowed is not None:
             allowed = allowed.repeat_interleave(goals.shape[1], dim=0)
         for layer in self.layers:
