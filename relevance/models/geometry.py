@@ -83,7 +83,7 @@ BODIES.register(
     BodyKind(
         config=GeometryConfig,
         make=GeometryBody,
-        version="1",
+        version="2",
         advantage="is told the true poses of all objects and sees no picture",
     ),
 )

@@ -193,7 +193,7 @@ BODIES.register(
     BodyKind(
         config=GlimpseConfig,
         make=GlimpseBody,
-        version="1",
+        version="2",
         advantage="sees the views of all objects, and learned from masks and poses",
     ),
 )
