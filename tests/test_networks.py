@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -52,9 +53,8 @@ def opened(path: str | Path) -> GraphNetwork:
 def asked(network: GraphNetwork | RelevanceModel, objects: int) -> np.ndarray:
     """Scores of made-up scenes: what they show is smooth, as pictures are."""
     rng, camera = np.random.default_rng(objects), network.camera
-    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    waves = np.stack([np.sin(x / a) * np.cos(y / a) for a in (9, 17, 31)], axis=-1)
-    image = (127 + 120 * waves).astype(np.uint8)
+    blots = rng.integers(0, 256, (camera.height // 16, camera.width // 16, 3), np.uint8)
+    image = cv2.resize(blots, (camera.width, camera.height))
     # Some stand at the very edge, where a window reaches beyond the picture.
     places = rng.integers(0, [camera.height - PATCH, camera.width - PATCH], (objects, 2))
     places[:2] = [[0, 0], [camera.height - PATCH, camera.width - PATCH]]

@@ -17,6 +17,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
@@ -62,6 +63,11 @@ def pick_device(choice: str = "auto") -> torch.device:
         raise RelevanceError(f"device {choice!r}: cannot be used here ({reason})") from None
 
 
+def device_name(device: torch.device) -> str:
+    """What trains there, in words."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type.upper()
+
+
 def checkpoint_id(dataset: Dataset, config: TrainConfig) -> str:
     """Name of what these settings make of this data: labels of their policy, training split."""
     return f"{config.model.body}-{content_hash([config.content_hash, data_hash(dataset, config)])}"
@@ -103,10 +109,13 @@ def check_graphs(model: RelevanceModel, graphs: Network, sizes: Sequence[int] = 
     Weights that are not finite have no scores to compare.
     """
     rng, camera = np.random.default_rng(0), model.camera
+    # Blots, of which every view shows some: what is nowhere, as in noise, is sought everywhere.
+    blots = rng.integers(0, 256, (camera.height // 16, camera.width // 16, 3), np.uint8)
+    image = cv2.resize(blots, (camera.width, camera.height))
     plain = deepcopy(model).to("cpu").float().eval()
     for count in sizes:
-        image = rng.integers(0, 256, (camera.height, camera.width, 3), np.uint8)
-        views = rng.integers(0, 256, (count, PATCH, PATCH, 3), np.uint8)
+        corners = rng.integers(0, [camera.height - PATCH, camera.width - PATCH], (count, 2))
+        views = np.stack([image[r : r + PATCH, c : c + PATCH] for r, c in corners])
         poses = rng.uniform(0, 3, (count, GEOMETRY)).astype(np.float32) if model.told else None
         goals = np.array([[0, 1], [1, 0], [count - 1, 0]])
         mine, its = plain.look(image, views, poses), graphs.look(image, views, poses)

@@ -37,7 +37,9 @@ def ship(
     kept = {key: value for key, value in meta.items() if key not in ("history", "calibration")}
     path = Path(out) / f"{name}.pt"
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_checkpoint(path, model.half(), kept)
+    for weight in model.parameters():  # what is computed of the camera stays as exact as it is
+        weight.data = weight.data.half()
+    save_checkpoint(path, model, kept)
     with replacing(path.with_suffix(".md")) as temporary:
         temporary.write_text(_card(name, Path(root), config, path, meta), encoding="utf-8")
     return path
@@ -62,10 +64,10 @@ A `{config.model.body}` of {meta["parameters"]:,} parameters: it {sees}.
 `relevance.load_guide("{name}")`, `relevance plan ... --checkpoint {name}`.
 
 - checkpoint `{meta["checkpoint_id"]}`, {path.stat().st_size / 1e6:.1f} MB, weights halved
-- trained in {meta["train_seconds"] / 60:.1f} minutes, {config.steps:,} steps, on data \
-`{meta["dataset_hash"]}`, labels of policy `{config.policy}`
+- trained in {meta["train_seconds"] / 60:.1f} minutes on {meta["device"]}, {config.steps:,} \
+steps, on data `{meta["dataset_hash"]}`, labels of policy `{config.policy}`
 - made by `{command(config, root)}`
-
+{_patience(meta)}
 Queries of the validation split (subject and reference left out), the network's own scores at
 beta = 0; the offset is what is added to them, so that beta = 0 is the decision that validation
 chose.
@@ -74,6 +76,13 @@ chose.
 |---|---|---|---|---|---|---|---|---|---|
 {chr(10).join(rows)}
 """
+
+
+def _patience(meta: Mapping[str, Any]) -> str:
+    """When it looks as a guide that waits, where that was chosen."""
+    if "patience" not in meta:
+        return ""
+    return f"- as `lazy` it looks after work of {meta['patience']:,} (`relevance tune`)\n"
 
 
 def command(config: TrainConfig, root: Path) -> str:

@@ -31,6 +31,7 @@ from relevance.training.catalogue import Catalogue
 from relevance.training.checkpoints import (
     checkpoint_id,
     data_hash,
+    device_name,
     load_checkpoint,
     pick_device,
     read_file,
@@ -248,6 +249,7 @@ def train(
                 "train_seconds": trainer.seconds,
                 "wait_seconds": trainer.waited,
                 "core_seconds": trainer.core_seconds,
+                "device": device_name(trainer.device),
                 "bfloat16": trainer.bfloat16,
                 "parameters": sum(p.numel() for p in trainer.model.parameters()),
                 "metrics": metrics,
