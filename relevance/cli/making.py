@@ -348,9 +348,10 @@ def _mine(_: Preset) -> Callable[..., int]:
         made = mine(dataset, out, scorer.checkpoint_id, config, score=score, policy=scorer.policy)
         if found := mined_of(Dataset.open(out)):
             goals = sum(len(failed.scene["goals"]) for failed in found.failed)
+            spared = f"kinds with a shard to spare: {', '.join(sorted(kinds))}"
             say(
                 f"{out}: {goals} goals failed in {len(found.failed)} of {len(found.looked_at)} "
-                f"validation scenes ({', '.join(sorted(kinds))})"
+                f"validation scenes ({spared})"
             )
         say(f"{out}: {make('scenes', scenes_work(out, made), workers).summary}")
         say(f"{out}: {make('scenes labelled', labels_work(out), workers).summary}")

@@ -12,7 +12,7 @@ from relevance.robot import GRASPABLE_EDGE
 from relevance.sampling.looks import nudged_color, nudged_light
 from relevance.sampling.settings import Jitter, SceneConfig
 from relevance.sampling.standing import Standing
-from relevance.scene import Box, Scene, SceneError
+from relevance.scene import Box, Scene
 from relevance.scene.geometry import packed
 
 
@@ -47,10 +47,7 @@ def near_copy(
         made[box.name] = moved
         standing.add(moved)
     objects = tuple(made[name] for name in scene.names)
-    try:
-        return replace(scene, id="", goals=(), objects=objects, light=light)
-    except SceneError:  # what stands on another may have come off its face
-        return None
+    return replace(scene, id="", goals=(), objects=objects, light=light)
 
 
 def _from_below(scene: Scene) -> list[Box]:
@@ -85,7 +82,8 @@ def _moved(
         floor = carrier.top if carrier else 0.0
         position = round(float(x), 4), round(float(y), 4), floor + size[2] / 2
         yaw = round(box.yaw + float(rng.uniform(-jitter.yaw, jitter.yaw)), 4)
-        if standing.admits(packed(size, position, yaw), under):
+        over = carrier is None or carrier.covers(*position[:2])
+        if over and standing.admits(packed(size, position, yaw), under):
             return replace(box, size=size, position=position, yaw=yaw)
     return None
 
