@@ -184,7 +184,7 @@ def _plans(
     predicate: Predicate,
     rows: list[dict[str, Any]],
     progress: Progress | None,
-    mined: Mined | None,
+    mined: Mined | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     plans: list[dict[str, Any]] = []
     timings: list[dict[str, Any]] = []
