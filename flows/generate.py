@@ -40,7 +40,7 @@ def generate(
     Args:
         dataset: Folder of the dataset, or s3://bucket/prefix; made when it is not there, appended
             to when it is smaller.
-        preset: Size and settings: smoke, demo, laptop, crowd or paper.
+        preset: Size and settings: smoke, demo, laptop, crowd, randomised or paper.
         overrides: Settings that differ from the preset, e.g. {"seed": 7}; keys may be dotted.
         max_workers: Processes that work at a time; the number of cores when empty.
         cluster: Address of a Dask scheduler whose workers make the shards instead, each of which

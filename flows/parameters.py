@@ -19,7 +19,7 @@ from relevance.configs import override
 from relevance.errors import RelevanceError
 
 Preset = Literal["smoke", "demo", "laptop", "paper"]
-DatasetPreset = Literal["smoke", "demo", "laptop", "crowd", "paper"]
+DatasetPreset = Literal["smoke", "demo", "laptop", "crowd", "randomised", "paper"]
 Overrides = dict[str, Any]
 
 

@@ -134,6 +134,7 @@ def test_a_shard_knows_its_predicates() -> None:
         ("demo", {"same-plane", "on"}),
         ("laptop", {"same-plane", "on", "stacks"}),
         ("crowd", {"same-plane", "stacks"}),
+        ("randomised", {"same-plane", "on", "stacks"}),
         ("paper", {"same-plane", "on"}),
     ],
 )

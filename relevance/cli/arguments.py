@@ -13,7 +13,7 @@ import tyro
 from relevance.cli.terminal import UsageError
 
 Preset = Literal["smoke", "demo", "laptop", "paper"]
-DatasetPreset = Literal["smoke", "demo", "laptop", "crowd", "paper"]
+DatasetPreset = Literal["smoke", "demo", "laptop", "crowd", "randomised", "paper"]
 """Sizes of datasets alone; the others are sizes of everything."""
 DatasetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATASET")]
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]

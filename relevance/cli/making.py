@@ -1,4 +1,4 @@
-"""Subcommands that make datasets: estimate, generate, label, append, repair, suite."""
+"""Subcommands that make datasets: estimate, generate, label, append, repair, suite, mine."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import dataclasses
@@ -16,6 +16,7 @@ from relevance.cli.arguments import (
     DatasetPreset,
     OptionalCount,
     OptionalName,
+    OptionalPath,
     Preset,
     Workers,
     at_least,
@@ -306,6 +307,59 @@ def _suite(_: Preset) -> Callable[..., int]:
     return suite
 
 
+def _mine(_: Preset) -> Callable[..., int]:
+    from relevance.pipeline import MiningConfig
+
+    start = MiningConfig()
+
+    def mine(
+        dataset: DatasetArg,
+        out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")],
+        checkpoint: OptionalPath = None,
+        workers: Workers = CORES,
+        config: Annotated[MiningConfig, tyro.conf.arg(name="")] = start,
+    ) -> int:
+        """Make training scenes of a checkpoint's failures on validation scenes, labels too.
+
+        Looks at every second validation shard, copies the scenes in which the checkpoint leaves
+        out something relevant, nearly, and asks the goals that failed. `relevance merge DATASET OUT
+        --into BOTH` joins both: the shards that were looked at are no validation shards there.
+
+        Args:
+            dataset: Folder of a labelled dataset.
+            out: Folder of the new dataset.
+            checkpoint: The model, a file or an id; the dataset's champion, else its newest.
+            workers: Processes that work at a time.
+        """
+        from relevance.evaluation import load_scorer, predict
+        from relevance.pipeline import labels_work, minable, mine, mined_of, scenes_work
+        from relevance.store import Dataset
+        from relevance.training import find_checkpoint
+
+        check_workers(workers)
+        path = find_checkpoint(dataset, checkpoint)
+        scorer = load_scorer(path)
+        kinds = {spec.family for spec in minable(Dataset.open(dataset))}
+
+        def score(shards: Sequence[int]) -> None:
+            with bar("shards scored") as progress:
+                predict(dataset, path, split="validation", shards=shards, progress=progress)
+
+        made = mine(dataset, out, scorer.checkpoint_id, config, score=score, policy=scorer.policy)
+        if found := mined_of(Dataset.open(out)):
+            goals = sum(len(failed.scene["goals"]) for failed in found.failed)
+            spared = f"kinds with a shard to spare: {', '.join(sorted(kinds))}"
+            say(
+                f"{out}: {goals} goals failed in {len(found.failed)} of {len(found.looked_at)} "
+                f"validation scenes ({spared})"
+            )
+        say(f"{out}: {make('scenes', scenes_work(out, made), workers).summary}")
+        say(f"{out}: {make('scenes labelled', labels_work(out), workers).summary}")
+        return 0
+
+    return mine
+
+
 COMMANDS = {
     "estimate": Command(
         make=_estimate,
@@ -345,5 +399,13 @@ COMMANDS = {
         make=_suite,
         about="a test set away from what networks learned from",
         examples=("relevance suite boxes-20 data/boxes-20 --scenes 50",),
+    ),
+    "mine": Command(
+        make=_mine,
+        about="training scenes of what a model got wrong",
+        examples=(
+            "relevance mine data/tables data/mined --copies 4",
+            "relevance mine data/tables data/random --copies 4 --random",
+        ),
     ),
 }

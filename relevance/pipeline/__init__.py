@@ -4,6 +4,7 @@ from relevance.pipeline.doing import Made, do
 from relevance.pipeline.estimating import Estimate, Quantities, actual, estimate
 from relevance.pipeline.labelling import label_shard, labelled
 from relevance.pipeline.merging import merge
+from relevance.pipeline.mining import Mined, MiningConfig, minable, mine, mined_of
 from relevance.pipeline.preparing import append, describe, pending, prepare
 from relevance.pipeline.scenes import ATTEMPTS, draw, generate_shard, generated
 from relevance.pipeline.settings import (
@@ -37,6 +38,8 @@ __all__ = [
     "Estimate",
     "Job",
     "Made",
+    "Mined",
+    "MiningConfig",
     "Quantities",
     "ShardReport",
     "ShardSpec",
@@ -58,6 +61,9 @@ __all__ = [
     "labels_work",
     "load_config",
     "merge",
+    "minable",
+    "mine",
+    "mined_of",
     "missing",
     "pending",
     "prepare",

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from relevance.labels import stored_scene
-from relevance.pipeline.settings import ShardSpec, load_config, shards_of
+from relevance.pipeline.mining import leaks, mined_of
+from relevance.pipeline.settings import ShardSpec, shards_of
 from relevance.pipeline.upkeep import integrity, refused
 from relevance.scene import (
     Pose,
@@ -122,13 +123,16 @@ def _merged(
             name = dataset.name_of(there.path / breach.file)
             breaches.append(replace(breach, file=name))
     # a file that cannot be read stops every query; it has been named
-    return breaches or list(_rules(dataset, set()))
+    if breaches:
+        return breaches
+    copied = [Breach(file=file, message=message) for file, message in leaks(dataset)]
+    return copied + list(_rules(dataset, set()))
 
 
 def _description(dataset: Dataset) -> Iterator[Breach]:
     specs: list[ShardSpec] = []
     try:
-        load_config(dataset)
+        mined_of(dataset)
         specs = shards_of(dataset)
     except DatasetError as error:
         yield Breach(file="dataset.json", message=_message(dataset, error))

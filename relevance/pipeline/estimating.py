@@ -25,7 +25,7 @@ from relevance.pipeline.settings import (
     shard_specs,
 )
 from relevance.scene import FAMILIES, group_of
-from relevance.store import SPLITS, Dataset, empty_size, locate, replacing, sql
+from relevance.store import SPLITS, Dataset, DatasetError, empty_size, locate, replacing, sql
 
 FILE = "estimate.json"
 """Within the dataset; it tells of a machine and a day, so it is no part of the promised bytes."""
@@ -123,6 +123,8 @@ def estimate(
     Of that many a predicate, where each has its own. Goals of the test split are replayed more
     often than others, so a part of the sample is of that split. Nothing of it is kept.
     """
+    if config.mined is not None:
+        raise DatasetError("a mined dataset: expected settings by which scenes are drawn at random")
     split_sizes = {"train": sample - sample // 4, "validation": 0, "test": sample // 4}
     families = [f for f in FAMILIES if any(config.counts(split).of(f) for split in SPLITS)]
     counts = {s: Counts.by_family(dict.fromkeys(families, n)) for s, n in split_sizes.items()}

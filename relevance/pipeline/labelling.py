@@ -17,6 +17,7 @@ from relevance.errors import RelevanceError
 from relevance.hashing import content_hash
 from relevance.labels import POLICIES, label_rows, plan_row, stored_scene, timing_row
 from relevance.pipeline.measuring import Progress, Stopwatch, compiled, took
+from relevance.pipeline.mining import Mined, mined_of
 from relevance.pipeline.preparing import set_aside
 from relevance.pipeline.settings import DatasetConfig, ShardReport, ShardSpec, refuse_merged
 from relevance.planner import plan, warm_up
@@ -142,7 +143,7 @@ def label_shard(
     if planned:
         plans = dataset.read_file(shard.place("plans", way)).to_pylist()
     else:
-        plans, timings = _plans(config, predicate, rows, progress)
+        plans, timings = _plans(config, predicate, rows, progress, mined_of(dataset, config))
         # Plans after timings and labels last: a finished plan file is never planned again.
         shard.write("timings", timings, way)
         shard.write("plans", plans, way)
@@ -183,6 +184,7 @@ def _plans(
     predicate: Predicate,
     rows: list[dict[str, Any]],
     progress: Progress | None,
+    mined: Mined | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     plans: list[dict[str, Any]] = []
     timings: list[dict[str, Any]] = []
@@ -191,7 +193,10 @@ def _plans(
         scene = stored_scene(row)
         share = config.test_replay_share if row["split"] == "test" else config.replay_share
         drawn_by, count = config.drawn_by, config.goals_per_scene
-        goals = sample_goals(scene, predicate, count, seed=drawn_by, config=config.goals)
+        if mined is not None:
+            goals = mined.goals(config, scene, predicate, row["index"])
+        else:
+            goals = sample_goals(scene, predicate, count, seed=drawn_by, config=config.goals)
         for goal in goals:
             result = plan(scene, goal, config=config.planner, replay=False)
             verdict, seconds = None, None

@@ -8,8 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from relevance.pipeline.mining import SPLIT, copied_shards, looked_at
 from relevance.pipeline.preparing import describe
-from relevance.pipeline.settings import Counts, ShardSpec, load_config, shards_of
+from relevance.pipeline.settings import ShardSpec, load_config, scenes_of, shards_of
 from relevance.store import SPLITS, Dataset, DatasetError, absolute, is_remote
 
 
@@ -18,8 +19,10 @@ def merge(sources: Sequence[str | Path], into: str | Path) -> Dataset:
 
     Its shards are numbered anew, one source after the other; every view, reader and trainer
     works on it. Labels that a source gets later, under another policy say, are seen here too;
-    shards that it gets later are not. Raises DatasetError for less than two sources, tables of
-    different versions, labels made in different ways, or a scene that is there twice.
+    shards that it gets later are not. Validation shards whose scenes one of the sources was mined
+    from are left out: copies of them are trained on. Raises DatasetError for less than two
+    sources, tables of different versions, labels made in different ways, or a scene that is there
+    twice.
     """
     target = absolute(into)
     datasets = [_flat(path) for path in sources]
@@ -32,6 +35,7 @@ def merge(sources: Sequence[str | Path], into: str | Path) -> Dataset:
     for other in rest:
         _same(head, other)
     _distinct(datasets)
+    seen = looked_at(datasets)
     first: dict[str, int] = dict.fromkeys(SPLITS, 0)
     entries: list[dict[str, Any]] = []
     specs: list[ShardSpec] = []
@@ -39,8 +43,12 @@ def merge(sources: Sequence[str | Path], into: str | Path) -> Dataset:
     for dataset in datasets:
         mine = shards_of(dataset)
         count = {split: sum(spec.split == split for spec in mine) for split in SPLITS}
-        entries.append({"path": _way(target, dataset.path), "first": dict(first), "count": count})
+        entry = {"path": _way(target, dataset.path), "first": dict(first), "count": count}
+        copied = copied_shards(dataset, seen)
+        entries.append({**entry, "without": {SPLIT: copied}} if copied else entry)
         for spec in mine:
+            if spec.split == SPLIT and spec.shard in copied:
+                continue
             specs.append(
                 replace(
                     spec,
@@ -52,9 +60,8 @@ def merge(sources: Sequence[str | Path], into: str | Path) -> Dataset:
             first[split] += count[split]
             scenes[split] += sum(spec.count for spec in mine if spec.split == split)
     config = load_config(head)
-    for split in SPLITS:
-        counts = Counts.total(load_config(dataset).counts(split) for dataset in datasets)
-        config = replace(config, **{split: counts})
+    kept = {split: scenes_of(specs, split, each=config.own_scenes) for split in SPLITS}
+    config = replace(config, mined=None, **kept)
     description = describe(config, specs)
     for key in ("planner_version", "tables", "versions"):
         description[key] = head.description.get(key)

@@ -100,6 +100,8 @@ def prepare(
     old = shards_of(there)
     specs = shard_specs(config, old)
     if specs != old:
+        if before.mined is not None:
+            raise DatasetError(f"{there.path}: holds what was mined and no more; mine another one")
         refuse_other_scenes(there, config)
     # asking for fewer than there are keeps what there is
     grown = {split: scenes_of(specs, split, each=config.own_scenes) for split in SPLITS}

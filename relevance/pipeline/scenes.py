@@ -12,6 +12,7 @@ from typing import Any
 
 from relevance.labels import scene_row
 from relevance.pipeline.measuring import Progress, Stopwatch, compiled, took
+from relevance.pipeline.mining import Mined, mined_of
 from relevance.pipeline.settings import (
     DatasetConfig,
     ShardReport,
@@ -64,11 +65,11 @@ def generate_shard(
     watch = Stopwatch()
     where: dict[str, Any] = {"split": spec.split, "shard": spec.shard}
     rows: list[dict[str, Any]] = []
-    config_hash = config.scenes_hash
+    config_hash, mined = config.scenes_hash, mined_of(dataset, config)
 
     def pictures(renderer: Renderer) -> Iterator[tuple[str, Rendering, str]]:
         for index in range(spec.first, spec.first + spec.count):
-            scene, rendering, attempt = draw(config, spec, index, renderer)
+            scene, rendering, attempt = draw(config, spec, index, renderer, mined)
             rows.append(
                 scene_row(
                     scene,
@@ -99,15 +100,22 @@ def generate_shard(
 
 
 def draw(
-    config: DatasetConfig, spec: ShardSpec, index: int, renderer: Renderer
+    config: DatasetConfig,
+    spec: ShardSpec,
+    index: int,
+    renderer: Renderer,
+    mined: Mined | None = None,
 ) -> tuple[Scene, Rendering, int]:
     """Scene `index` of a shard with its rendering, and how many draws were rejected before it."""
     settings = settings_of_family(config.scene, spec.family)
     reason = "no room"
     for attempt in range(ATTEMPTS):
-        scene = sample_scene(
-            settings, seed=config.seed, index=index, split=spec.split, attempt=attempt
-        )
+        if mined is not None:
+            scene = mined.draw(config, spec.family, index, attempt)
+        else:
+            scene = sample_scene(
+                settings, seed=config.seed, index=index, split=spec.split, attempt=attempt
+            )
         if scene is None:
             continue
         rendering = renderer.render(scene)
@@ -122,6 +130,8 @@ def draw(
 
 def try_out(config: DatasetConfig) -> None:
     """Draw and render the first scene of each family; raises DatasetError when there is none."""
+    if config.mined is not None:
+        raise DatasetError(f"mined: expected none, found {config.mined}; `relevance mine` makes it")
     first = {spec.family: spec for spec in reversed(shard_specs(config))}
     if first:
         with Renderer() as renderer:

@@ -16,7 +16,7 @@ from pydantic import Field, TypeAdapter, ValidationError, field_validator
 from relevance.configs import ConfigError, config, first_error, identity_hash
 from relevance.labels import LABELS_VERSION, POLICIES
 from relevance.planner import PLANNER_VERSION, PlannerConfig
-from relevance.sampling import SAMPLER_VERSION, GoalConfig, SceneConfig
+from relevance.sampling import SAMPLER_VERSION, GoalConfig, Randomisation, SceneConfig
 from relevance.scene import FAMILIES, Predicate, asked_of
 from relevance.simulation import RENDERER_VERSION
 from relevance.store import SPLITS, Dataset, DatasetError, Labelling
@@ -96,6 +96,9 @@ class DatasetConfig:
     """Seed of the goals alone, for another goal set over the same scenes; None: `seed`."""
     policy: str = "found"
     """How relevance is read from the plans."""
+    mined: str | None = None
+    """Hash of what `relevance mine` found, of which the scenes are near copies and which they are
+    asked (`mined.json`); None: all is drawn at random."""
 
     @field_validator("policy")
     @classmethod
@@ -114,6 +117,7 @@ class DatasetConfig:
         return DatasetConfig(
             seed=self.seed,
             own_scenes=self.own_scenes,
+            mined=self.mined,
             scene=settings_of_family(self.scene, FAMILIES[0]),
         )
 
@@ -127,6 +131,7 @@ class DatasetConfig:
             planner=self.planner,
             replay_share=self.replay_share,
             test_replay_share=self.test_replay_share,
+            mined=self.mined,
         )
 
     @property
@@ -199,6 +204,18 @@ class DatasetConfig:
             scene=SceneConfig(min_objects=3, max_objects=30),
             planner=PlannerConfig(max_actions=12),
             test_replay_share=0.2,
+        )
+
+    @classmethod
+    def randomised(cls) -> DatasetConfig:
+        """Some half an hour on one core: lights, tables, cameras and colours differ by scene."""
+        return cls(
+            train=Counts(same_plane=3_000, on=5_000, stacks=1_500),
+            validation=Counts(same_plane=300, on=400, stacks=200),
+            test=Counts(same_plane=300, on=500, stacks=200),
+            scenes_per_shard=100,
+            goals_per_scene=6,
+            scene=SceneConfig(randomisation=Randomisation()),
         )
 
     @classmethod

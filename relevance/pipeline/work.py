@@ -153,6 +153,8 @@ def labels_work(
     goals = {"goals_per_scene": goals_per_scene, "goals_seed": goals_seed}
     changes = {**(overrides or {}), **{k: v for k, v in goals.items() if v is not None}}
     dataset = resumed(root)
+    if load_config(dataset).mined is not None and {"goals_per_scene", "goals_seed"} & {*changes}:
+        raise RelevanceError(f"{root}: is asked the goals that were mined, expected no others")
     under_way = None if replan or changes or policy else pending(dataset)
     config = override(under_way or load_config(dataset), changes)
     specs = prepare(root, config, replan=replan or bool(changes))

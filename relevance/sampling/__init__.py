@@ -15,12 +15,14 @@ defaults about 14% (same-plane) and 30% (`on`) of the queries are relevant; in t
 30%. All of it is configuration, hence in every row's hash.
 """
 
+from relevance.sampling.copies import near_copy
 from relevance.sampling.goals import sample_goals
 from relevance.sampling.looks import same_view, view_of
 from relevance.sampling.scenes import sample_scene
 from relevance.sampling.settings import (
     SAMPLER_VERSION,
     GoalConfig,
+    Jitter,
     Randomisation,
     SceneConfig,
 )
@@ -30,8 +32,10 @@ __all__ = [
     "ATTEMPTS",
     "SAMPLER_VERSION",
     "GoalConfig",
+    "Jitter",
     "Randomisation",
     "SceneConfig",
+    "near_copy",
     "same_view",
     "sample_goals",
     "sample_scene",

@@ -14,7 +14,7 @@ import numpy as np
 
 from relevance.sampling.colors import from_hsv
 from relevance.sampling.settings import Randomisation
-from relevance.scene import TEXTURES, Camera, Light, Table, Texture
+from relevance.scene import TEXTURES, Camera, Color, Light, Table, Texture
 
 
 def draw_light(rng: np.random.Generator, light: Light, ranges: Randomisation) -> Light:
@@ -30,6 +30,26 @@ def draw_light(rng: np.random.Generator, light: Light, ranges: Randomisation) ->
         ambient=round(rng.uniform(*ranges.light_ambient), 4),
         diffuse=round(rng.uniform(*ranges.light_diffuse), 4),
     )
+
+
+def nudged_light(rng: np.random.Generator, light: Light, most: float) -> Light:
+    """Nearly the same light: see `Jitter.light`."""
+    direction = np.array(light.direction)
+    direction = direction + rng.uniform(-most, most, 3) * np.linalg.norm(direction)
+    strengths = np.array([light.ambient, light.diffuse]) + rng.uniform(-most, most, 2)
+    ambient, diffuse = (round(float(value), 4) for value in np.clip(strengths, 0, 1))
+    return replace(
+        light,
+        direction=_rounded(direction),
+        color=nudged_color(rng, light.color, most),
+        ambient=ambient,
+        diffuse=diffuse,
+    )
+
+
+def nudged_color(rng: np.random.Generator, color: Color, most: float) -> Color:
+    """Nearly the same colour."""
+    return _rounded(np.clip(np.array(color) + rng.uniform(-most, most, 3), 0, 1))
 
 
 def draw_table(rng: np.random.Generator, table: Table, ranges: Randomisation) -> Table:

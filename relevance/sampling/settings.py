@@ -188,6 +188,23 @@ class SceneConfig:
 
 
 @config
+class Jitter:
+    """How far a near copy of a scene may be from it; every draw is uniform, both ways."""
+
+    position: NotNegative = 0.004
+    """Of a box along x and y, m; of one that stands on another, relative to that."""
+    yaw: NotNegative = 0.05
+    """Of a box, rad."""
+    size: NotNegative = 0.002
+    """Of each edge, m; what the hand can take stays so, and what it cannot."""
+    color: Annotated[float, Field(ge=0, le=0.1)] = 0.03
+    """Of each channel of a box's colour (0..1); boxes of one colour stay of one colour."""
+    light: Annotated[float, Field(ge=0, le=0.2)] = 0.05
+    """Of the light's strengths and colour (0..1), and of its direction (1: as much as its
+    length)."""
+
+
+@config
 class GoalConfig:
     """The odds of goals; they look at who carries whom, never at plans."""
 

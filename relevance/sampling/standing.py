@@ -72,7 +72,9 @@ class _Shown(NamedTuple):
 class Standing:
     """The boxes drawn so far, as the arm and the camera meet them; candidates come as rows."""
 
-    def __init__(self, config: SceneConfig) -> None:
+    def __init__(self, config: SceneConfig, *, most: int | None = None) -> None:
+        """most: how many boxes there will be at most, as `config` says when None."""
+        self.config = config
         self.boxes: list[Box] = []
         margin, (x, y), camera = config.table_margin, config.table.size, config.camera
         limits = (
@@ -92,7 +94,7 @@ class Standing:
         turn = config.robot.yaw
         self._turn = math.cos(turn), math.sin(turn)
         self._eye, self._axes, self._focal = pinhole(camera)
-        most = config.numbers[1]
+        most = most or config.numbers[1]
         self._shown = _Shown(
             np.empty((most, UPRIGHT)),
             np.empty((most, 4)),

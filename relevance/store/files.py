@@ -41,10 +41,13 @@ class Source:
     """The number that its shard 0 of each split has in the merged dataset."""
     count: Mapping[str, int]
     """Its number of shards of each split when it was merged."""
+    without: Mapping[str, Sequence[int]]
+    """Its shards of each split that were left out; nothing takes their numbers."""
 
     def number(self, split: str, shard: int) -> int | None:
-        """The merged dataset's number of a shard; None when it was made after the merge."""
-        return self.first[split] + shard if shard < self.count[split] else None
+        """The merged dataset's number of a shard; None when it was left out or made later."""
+        there = shard < self.count[split] and shard not in self.without.get(split, ())
+        return self.first[split] + shard if there else None
 
 
 class Files:
@@ -61,7 +64,12 @@ class Files:
             if not is_remote(path):
                 # seen from the real place: `..` of a symbolic link leads elsewhere
                 path = (self.path.resolve() / path).resolve()
-            yield Source(dataset=type(self).open(path), first=item["first"], count=item["count"])
+            yield Source(
+                dataset=type(self).open(path),
+                first=item["first"],
+                count=item["count"],
+                without=item.get("without", {}),
+            )
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.path)!r})"
@@ -181,7 +189,7 @@ class Files:
     def file_keys(self, file: Path) -> dict[str, Any]:
         """What a file's path says of its rows: `key=value` folders and the shard number.
 
-        A source's shard that was made after the merge has no number.
+        A source's shard that was left out of the merge, or made after it, has no number.
         """
         source = self._source_of(file)
         if source is None:
