@@ -40,7 +40,7 @@ from relevance.scene import PREDICATES
 from relevance.store import Dataset
 from relevance.training.settings import TrainConfig
 
-STATE_VERSION = 2
+STATE_VERSION = 3
 """Version of the files of unfinished runs."""
 
 

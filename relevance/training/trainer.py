@@ -70,6 +70,12 @@ class Trainer:
         self.history: list[dict[str, float]] = []
         """Loss and its parts, averaged between two entries; each with its step."""
         self._sums: dict[str, float] = {}
+        self.scenes = 0
+        """Scenes that were shown, each time one was."""
+        self.asked: dict[str, int] = {}
+        """By predicate, queries that were answered, subject and reference left out."""
+        self.validations: list[dict[str, Any]] = []
+        """What some validation scenes said on the way; each with its step."""
         self.device = ranks.device(pick_device(config.device))
         # Weights are drawn before they move: equal ones on every device.
         learned = trained_predicates(predicates, config)
@@ -141,6 +147,7 @@ class Trainer:
         self.optimizer.step()
         self.done += 1
         self._record(values)
+        self._count(batches)
         return values
 
     def _record(self, values: dict[str, float]) -> None:
@@ -153,6 +160,13 @@ class Trainer:
             self.history.append({"step": float(self.done), **means})
             self._sums = {}
 
+    def _count(self, batches: Sequence[Batch]) -> None:
+        for batch in batches:
+            self.scenes += len(batch.names)
+            for predicate, goals, _, labelled in batch.turns:
+                asked = int(labelled.sum() - labelled.gather(-1, goals).sum())
+                self.asked[predicate.name] = self.asked.get(predicate.name, 0) + asked
+
     def state(self) -> dict[str, Any]:
         """All that the rest of the run depends on."""
         return {
@@ -162,6 +176,9 @@ class Trainer:
             "core_seconds": self.core_seconds,
             "history": self.history,
             "sums": self._sums,
+            "scenes": self.scenes,
+            "asked": self.asked,
+            "validations": self.validations,
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
         }
@@ -173,6 +190,8 @@ class Trainer:
         self.done, self.seconds, self.waited = (state[k] for k in ("done", "seconds", "waited"))
         self.core_seconds = state["core_seconds"]
         self.history, self._sums = list(state["history"]), dict(state["sums"])
+        self.scenes, self.asked = state["scenes"], dict(state["asked"])
+        self.validations = list(state["validations"])
 
 
 def trained_predicates(predicates: Sequence[Predicate], config: TrainConfig) -> list[str]:
@@ -225,6 +244,7 @@ def train(
     with on_threads(config.threads), together() as ranks:
         trainer = Trainer(own, catalogue.predicates, start, ranks)
         run.resume(trainer)
+        validation = Catalogue.of(dataset, "validation", config)
         with closing(reader_for(catalogue, trainer).steps(trainer.done)) as steps:
             while trainer.done < config.steps:
                 try:
@@ -234,10 +254,12 @@ def train(
                     raise
                 if progress and ranks.first:
                     progress(trainer.done, config.steps)
+                if ranks.first and trainer.done in _validated(config):
+                    _validate(trainer, validation)
                 if trainer.done % config.save_every == 0 and trainer.done < config.steps:
                     run.save(trainer)
+        scenes, *asked = ranks.totals([trainer.scenes, *trainer.asked.values()])
         if ranks.first:
-            validation = Catalogue.of(dataset, "validation", config)
             metrics = measure(trainer.model, reader_for(validation, trainer).whole())
             meta = {
                 "checkpoint_id": name,
@@ -254,12 +276,29 @@ def train(
                 "offsets": offsets(metrics, before),
                 "yaws": yaws(dataset),
                 "history": trainer.history,
+                "validations": trainer.validations,
+                "scenes": scenes,
+                "asked": dict(zip(trainer.asked, asked, strict=True)),
             }
             save_checkpoint(path, trainer.model, meta)
             write_row(dataset, path, meta)
             run.path.unlink(missing_ok=True)
         ranks.wait()
     return path
+
+
+def _validated(config: TrainConfig) -> set[int]:
+    """The steps after which the learning curve gets a point; the last one of them."""
+    times = config.validations
+    return {-(-config.steps * time // times) for time in range(1, times + 1)}
+
+
+def _validate(trainer: Trainer, validation: Catalogue) -> None:
+    """Judge some validation scenes: a point of the learning curve."""
+    some = validation.some(trainer.config.validation_scenes)
+    found = measure(trainer.model, reader_for(some, trainer).whole())
+    queries = {group: its["queries"] for group, its in found.items()}
+    trainer.validations.append({"step": trainer.done, "queries": queries})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
