@@ -131,7 +131,7 @@ class Catalogue:
         return tuple(predicate for group in self.groups for predicate in group)
 
     def some(self, scenes: int) -> Self:
-        """The first shards of each family that have so many scenes together, to be read whole."""
+        """With the first shards of each family alone that have so many scenes together."""
         return replace(self, shards=tuple(_first(self.shards, lambda _: scenes)))
 
     def read(self, shard: Shard, predicates: Sequence[Predicate]) -> Iterator[Example]:

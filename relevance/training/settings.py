@@ -105,7 +105,7 @@ class TrainConfig:
     """How often, evenly over the steps, some validation scenes are judged for the learning curve;
     none of it is in the run's times."""
     validation_scenes: Count = execution(100)
-    """How many of each family that are, by whole shards."""
+    """How many of each family that are."""
     workers: Annotated[int, Field(ge=0)] | None = execution(None)
     """Processes that read and decode ahead, for each that trains; none with 0; one beside a CPU,
     more beside an accelerator when not given."""

@@ -295,8 +295,9 @@ def _validated(config: TrainConfig) -> set[int]:
 
 def _validate(trainer: Trainer, validation: Catalogue) -> None:
     """Judge some validation scenes: a point of the learning curve."""
-    some = validation.some(trainer.config.validation_scenes)
-    found = measure(trainer.model, reader_for(some, trainer).whole())
+    most = trainer.config.validation_scenes
+    some = reader_for(validation.some(most), trainer)
+    found = measure(trainer.model, some.whole(most=most))
     queries = {group: its["queries"] for group, its in found.items()}
     trainer.validations.append({"step": trainer.done, "queries": queries})
 
@@ -407,10 +408,35 @@ def measure(
     its four predicates; what a predicate is asked in another family than its own stands under
     that family.
     """
+    return metrics_of(judged(model, batches, offsets))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judged:
+    """What a model says of the goals of a predicate in a batch, offset included.
+
+    Shape suffixes: B scenes, G goals, N objects.
+    """
+
+    batch: Batch
+    predicate: Predicate
+    goals: np.ndarray
+    """(B, G, 2) places of subject and reference."""
+    score: np.ndarray
+    """(B, G, N)."""
+    relevant: np.ndarray
+    labelled: np.ndarray
+    query: np.ndarray
+    """(B, G, N) bool; False for subject and reference."""
+
+
+def judged(
+    model: RelevanceModel, batches: Iterable[Batch], offsets: Mapping[str, float] = {}
+) -> Iterator[Judged]:
+    """Score all goals of the batches, those of the model's predicates."""
     model.eval()
-    pooled: dict[str, list[tuple[np.ndarray, ...]]] = {}
-    with torch.inference_mode():
-        for batch in batches:
+    for batch in batches:
+        with torch.inference_mode():
             drawn = batch.to(model.device)
             encoding = model.encode(drawn.image, drawn.views, drawn.present, drawn.geometry)
             for predicate, goals, relevant, labelled in drawn.turns:
@@ -419,13 +445,23 @@ def measure(
                 score = model.decode(encoding, predicate, goals, labelled)
                 score = score + offsets.get(predicate.name, 0.0)
                 places = torch.arange(score.shape[-1], device=score.device)
-                asked = places[:, None] != goals[..., None, :]
-                arrays = (score, relevant.bool(), labelled, asked.all(-1))
-                for family in set(drawn.families):
-                    own = [i for i, its in enumerate(drawn.families) if its == family]
-                    rows = tuple(array[own].flatten(0, 1).cpu().numpy() for array in arrays)
-                    for name in {group_of(predicate.name, family), family}:
-                        pooled.setdefault(name, []).append(rows)
+                query = (places[:, None] != goals[..., None, :]).all(-1)
+                arrays = (goals, score, relevant.bool(), labelled, query)
+                names = ("goals", "score", "relevant", "labelled", "query")
+                found = {n: a.cpu().numpy() for n, a in zip(names, arrays, strict=True)}
+                yield Judged(batch=batch, predicate=predicate, **found)
+
+
+def metrics_of(found: Iterable[Judged]) -> dict[str, Any]:
+    """Metrics of what a model said, see `measure`."""
+    pooled: dict[str, list[tuple[np.ndarray, ...]]] = {}
+    for one in found:
+        arrays = (one.score, one.relevant, one.labelled, one.query)
+        for family in set(one.batch.families):
+            own = [i for i, its in enumerate(one.batch.families) if its == family]
+            rows = tuple(array[own].reshape(-1, array.shape[-1]) for array in arrays)
+            for name in {group_of(one.predicate.name, family), family}:
+                pooled.setdefault(name, []).append(rows)
     return {name: _metrics(parts) for name, parts in sorted(pooled.items())}
 
 
