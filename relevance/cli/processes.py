@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from relevance.cli.arguments import check_workers
 from relevance.cli.terminal import bar, say
@@ -20,6 +20,20 @@ def processes(what: str, total: int, n: int) -> Iterator[Outcomes[Unit]]:
     check_workers(n)
     with bar(what) as progress:
         yield pool(n, total, progress)
+
+
+def pools(n: int) -> Callable[[str, int], Outcomes[Unit]]:
+    """Makes pools of n processes, of what is done and how many steps it has."""
+    check_workers(n)
+
+    def made(what: str, total: int) -> Outcomes[Unit]:
+        def outcomes(units: Mapping[str, Unit]) -> Generator[tuple[str, Any], None, None]:
+            with processes(what, total, n) as own:
+                yield from own(units)
+
+        return outcomes
+
+    return made
 
 
 def make(what: str, work: Work, n: int) -> Made:

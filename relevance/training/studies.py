@@ -29,6 +29,8 @@ class Run:
     """Its steps mean nothing: those that fit into the time are taken."""
     share: float = 1.0
     """Of the study's time for a run."""
+    curve: str = ""
+    """The picture that its learning curve is in; in none when empty."""
     ship: str = ""
     """The name under which it comes with the package, if it does."""
 
@@ -101,6 +103,7 @@ def _runs(body: str, recipe: str, seeds: int = 1) -> Iterator[Run]:
                 recipe=recipe,
                 config=replace(config, seed=seed),
                 share=1 / len(networks),
+                curve=recipe,
             )
 
 
@@ -119,7 +122,7 @@ def _bodies() -> Iterator[Run]:
         for run in _runs(body, "fair"):
             for polling in ("turns", "rounds", "one-by-one"):
                 config = replace(run.config, polling=polling, share_encodings=False)
-                yield replace(run, label=f"{body} {polling}", config=config)
+                yield replace(run, label=f"{body} {polling}", config=config, curve="polling")
 
 
 def _data() -> Iterator[Run]:
@@ -141,6 +144,7 @@ def _some_data(body: str, share: float, goals: int, time: float) -> Run:
         recipe="long",
         config=replace(config, scene_share=share, scene_goals=goals),
         share=time,
+        curve="" if goals or time < 1 else body,
     )
 
 

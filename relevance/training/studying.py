@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from relevance.errors import RelevanceError
-from relevance.store import Dataset, replacing
+from relevance.store import Dataset, DatasetError, replacing
 from relevance.training.budget import one_core, steps_within
 from relevance.training.catalogue import Catalogue
 from relevance.training.checkpoints import checkpoint_id, load_checkpoint
@@ -94,15 +94,18 @@ def run_study(
     other; it raises in the end.
     """
     pools = pooled or (lambda what, total: pool(processes))
+    dataset = Dataset.open(plan.root)
+    if not dataset.files("labels", split="test"):
+        raise DatasetError(f"{dataset.path}: no labels of split test, which a study is judged by")
     plan.folder.mkdir(parents=True, exist_ok=True)
     steps = _steps(plan, pools, told)
     networks = {run.name: _settled(plan, run, steps[_alike(plan, run)]) for run in plan.runs}
-    dataset = Dataset.open(plan.root)
     names = {name: checkpoint_id(dataset, config) for name, config in networks.items()}
     jobs = {
         name: Training(plan=plan, config=config)
         for name, config in networks.items()
         if not plan.row_file(names[name]).exists()
+        or not dataset.files("predictions", name=names[name])
     }
     written = _write(plan, names)
 
@@ -123,8 +126,9 @@ def _write(plan: Plan, names: Mapping[str, str]) -> list[Row]:
     for run in plan.runs:
         file = plan.row_file(names[run.name])
         if file.exists():
-            head = {"study": plan.study, "run": run.name, "label": run.label, "recipe": run.recipe}
-            rows.append({**head, "ship": run.ship, **json.loads(file.read_text())})
+            head = {"study": plan.study, "run": run.name}
+            head |= {name: getattr(run, name) for name in ("label", "recipe", "curve", "ship")}
+            rows.append({**head, **json.loads(file.read_text())})
     with replacing(plan.table) as temporary:
         temporary.write_text("".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
     return rows

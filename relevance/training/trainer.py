@@ -73,7 +73,8 @@ class Trainer:
         self.scenes = 0
         """Scenes that were shown, each time one was."""
         self.asked: dict[str, int] = {}
-        """By predicate, queries that were answered, subject and reference left out."""
+        """By predicate (or family, see `group_of`), queries that were answered: subject and
+        reference left out, repetitions counted."""
         self.validations: list[dict[str, Any]] = []
         """What some validation scenes said on the way; each with its step."""
         self.device = ranks.device(pick_device(config.device))
@@ -164,8 +165,10 @@ class Trainer:
         for batch in batches:
             self.scenes += len(batch.names)
             for predicate, goals, _, labelled in batch.turns:
-                asked = int(labelled.sum() - labelled.gather(-1, goals).sum())
-                self.asked[predicate.name] = self.asked.get(predicate.name, 0) + asked
+                asked = labelled.sum((1, 2)) - labelled.gather(-1, goals).sum((1, 2))
+                for family, count in zip(batch.families, asked.tolist(), strict=True):
+                    group = group_of(predicate.name, family)
+                    self.asked[group] = self.asked.get(group, 0) + count
 
     def state(self) -> dict[str, Any]:
         """All that the rest of the run depends on."""
