@@ -155,6 +155,7 @@ def _figures(
         "asked": asked,
         "of_paper": _of_paper(asked, group),
     }
+    learned: dict[str, Any] = {name: value if network else None for name, value in took.items()}
     theirs = None if stands else paper().test.get(group)
     return Scored(
         label=row["label"] if network else judge,
@@ -164,7 +165,7 @@ def _figures(
         stands=stands,
         goals=goals,
         **about,
-        **{name: value if network else None for name, value in took.items()},
+        **learned,
         queries=found.n_rows,
         base_rate=found.base_rate,
         true_relevant=found.true_relevant,
