@@ -152,6 +152,19 @@ def test_a_learning_curve_changes_no_weight_and_survives_a_kill(tmp_path: Path) 
     assert 0 < asked["relevant"] + asked["irrelevant"] < whole["relevant"] + whole["irrelevant"]
 
 
+@pytest.mark.parametrize("split", ["train", "validation"])
+def test_goals_are_counted_where_they_are_wanted(split: str) -> None:
+    """Goals of each scene and predicate that are read whole."""
+
+    def most(config: TrainConfig) -> int:
+        batches = reader(ruled(), config, split).whole()
+        return max(int(turn[3].any(-1).sum(-1).max()) for batch in batches for turn in batch.turns)
+
+    assert most(CONFIG) == 2
+    assert most(replace(CONFIG, scene_goals=1)) == (1 if split == "train" else 2)
+    assert most(replace(CONFIG, validation_goals=1)) == (1 if split == "validation" else 2)
+
+
 def test_a_run_says_how_much_it_was_asked(tmp_path: Path) -> None:
     root = copied(tmp_path)
     _, meta = load_checkpoint(train(root, CONFIG))

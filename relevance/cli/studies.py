@@ -25,7 +25,7 @@ def _study(_: Preset) -> Callable[..., int]:
         workers: Workers = 1,
         only: Words = (),
         device: str = "cpu",
-        test_scenes: OptionalCount = None,
+        goals: OptionalCount = None,
         out: Path = Path("data/studies"),
         models: Path = Path("data/models"),
     ) -> int:
@@ -48,7 +48,8 @@ def _study(_: Preset) -> Callable[..., int]:
             workers: Networks that are trained at a time, each on one thread.
             only: Runs with one of these words in their names; all when not given.
             device: Where they are trained.
-            test_scenes: How many test scenes of each shard are judged; all when not given.
+            goals: Of each scene and predicate, the most that networks are judged by, 0 for all;
+                the study's own when not given.
             out: Folder of the tables.
             models: Where what comes with the package is written to (study ship, study crowd).
         """
@@ -57,9 +58,9 @@ def _study(_: Preset) -> Callable[..., int]:
         from relevance.training import Plan, TrainConfig, run_study, ship
 
         at_least("--minutes", minutes, 0)
-        at_least("--test-scenes", test_scenes, 1)
-        more = {"only": only, "device": device, "test_scenes": test_scenes, "folder": out}
-        plan = Plan.of(dataset, study, minutes=minutes, **more)
+        at_least("--goals", goals, 0)
+        more = {"only": only, "device": device, "folder": out}
+        plan = Plan.of(dataset, study, minutes=minutes, goals=goals, **more)
 
         rows = run_study(plan, pooled=pools(workers), told=say)
         with bar("runs judged") as progress:

@@ -59,7 +59,8 @@ class Catalogue:
         """
         one_labelling(dataset, split, config.policy)
         learning = split == "train"
-        goals = config.scene_goals if learning else 0
+        most = {"train": config.scene_goals, "validation": config.validation_goals}
+        goals = most.get(split, 0)
         files: dict[int, dict[str, tuple[str, str]]] = {}
         for file in dataset.files_under("labels", config.policy, split=split):
             keys = dataset.file_keys(file)
@@ -131,8 +132,9 @@ class Catalogue:
         return tuple(predicate for group in self.groups for predicate in group)
 
     def some(self, scenes: int) -> Self:
-        """With the first shards of each family alone that have so many scenes together."""
-        return replace(self, shards=tuple(_first(self.shards, lambda _: scenes)))
+        """With the first shards of each family alone that have so many scenes together, and a goal
+        of each scene and predicate: to be read whole."""
+        return replace(self, shards=tuple(_first(self.shards, lambda _: scenes)), goals=1)
 
     def read(self, shard: Shard, predicates: Sequence[Predicate]) -> Iterator[Example]:
         """The examples of a shard that have a label of one of the predicates, in stored order.

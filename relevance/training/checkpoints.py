@@ -62,7 +62,12 @@ def pick_device(choice: str = "auto") -> torch.device:
 
 def checkpoint_id(dataset: Dataset, config: TrainConfig) -> str:
     """Name of what these settings make of this data: labels of their policy, training split."""
-    return f"{config.model.body}-{content_hash([config.content_hash, data_hash(dataset, config)])}"
+    return id_of(config, data_hash(dataset, config))
+
+
+def id_of(config: TrainConfig, data: str) -> str:
+    """The same for data of a known hash."""
+    return f"{config.model.body}-{content_hash([config.content_hash, data])}"
 
 
 def data_hash(dataset: Dataset, config: TrainConfig) -> str:

@@ -101,9 +101,12 @@ class TrainConfig:
     """CPU threads; 0 leaves torch's choice."""
     save_every: Count = execution(50)
     """Steps between saved states."""
+    validation_goals: Annotated[int, Field(ge=0)] = 0
+    """Of each validation scene and predicate, the most goals that the decision is chosen by; all
+    with 0. (Bodies that look anew for each query take their time.)"""
     validations: Annotated[int, Field(ge=0)] = execution(0)
-    """How often, evenly over the steps, some validation scenes are judged for the learning curve;
-    none of it is in the run's times."""
+    """How often, evenly over the steps, some validation scenes are judged for the learning curve,
+    by a goal of each predicate; none of it is in the run's times."""
     validation_scenes: Count = execution(100)
     """How many of each family that are."""
     workers: Annotated[int, Field(ge=0)] | None = execution(None)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from relevance.errors import RelevanceError
 from relevance.store import Dataset, DatasetError, replacing
 from relevance.training.budget import one_core, steps_within
 from relevance.training.catalogue import Catalogue
-from relevance.training.checkpoints import checkpoint_id, load_checkpoint
+from relevance.training.checkpoints import id_of, load_checkpoint
 from relevance.training.reading import Reader
 from relevance.training.settings import TrainConfig
 from relevance.training.studies import STUDIES, Run
@@ -44,14 +45,24 @@ class Plan:
     only: tuple[str, ...] = ()
     """Runs with one of these words in their name; all without any."""
     device: str = "cpu"
-    test_scenes: int | None = None
-    """How many test scenes of each shard are judged; all when None."""
+    goals: int = 0
+    """Of each scene and predicate, the most goals that networks are judged by; all with 0."""
 
     @classmethod
-    def of(cls, root: str | Path, study: str, *, minutes: float | None = None, **more: Any) -> Plan:
-        """The study of that name, at its own time unless another is given."""
-        minutes = STUDIES[study].minutes if minutes is None else minutes
-        return cls(root=Path(root), study=study, minutes=minutes, **more)
+    def of(
+        cls,
+        root: str | Path,
+        study: str,
+        *,
+        minutes: float | None = None,
+        goals: int | None = None,
+        **more: Any,
+    ) -> Plan:
+        """The study of that name, with its own time and goals unless others are given."""
+        own = STUDIES[study]
+        minutes = own.minutes if minutes is None else minutes
+        goals = own.goals if goals is None else goals
+        return cls(root=Path(root), study=study, minutes=minutes, goals=goals, **more)
 
     @property
     def runs(self) -> list[Run]:
@@ -71,8 +82,7 @@ class Plan:
 
     def row_file(self, name: str) -> Path:
         """Where the row of a checkpoint is."""
-        some = "" if self.test_scenes is None else f"-{self.test_scenes}"
-        return self.folder / "rows" / f"{name}{some}.json"
+        return self.folder / "rows" / f"{name}.json"
 
     @property
     def table(self) -> Path:
@@ -98,9 +108,10 @@ def run_study(
     if not dataset.files("labels", split="test"):
         raise DatasetError(f"{dataset.path}: no labels of split test, which a study is judged by")
     plan.folder.mkdir(parents=True, exist_ok=True)
-    steps = _steps(plan, pools, told)
-    networks = {run.name: _settled(plan, run, steps[_alike(plan, run)]) for run in plan.runs}
-    names = {name: checkpoint_id(dataset, config) for name, config in networks.items()}
+    named = _names(dataset)
+    steps = _steps(plan, named, pools, told)
+    networks = {run.name: _settled(plan, run, steps[_alike(plan, named, run)]) for run in plan.runs}
+    names = {name: named(config) for name, config in networks.items()}
     jobs = {
         name: Training(plan=plan, config=config)
         for name, config in networks.items()
@@ -118,6 +129,12 @@ def run_study(
         gather(plan.study, jobs, outcomes, made=made, warn=told, unit="run")
         written = _write(plan, names)
     return written
+
+
+def _names(dataset: Dataset) -> Callable[[TrainConfig], str]:
+    """Ids of checkpoints; the data is hashed once."""
+    data = cache(lambda policy: dataset.content_hash(policy=policy, split="train"))
+    return lambda config: id_of(config, data(config.policy))
 
 
 def _write(plan: Plan, names: Mapping[str, str]) -> list[Row]:
@@ -153,7 +170,10 @@ class Fitting:
 
 
 def _steps(
-    plan: Plan, pools: Callable[[str, int], Outcomes[Unit]], told: Callable[[str], None]
+    plan: Plan,
+    named: Callable[[TrainConfig], str],
+    pools: Callable[[str, int], Outcomes[Unit]],
+    told: Callable[[str], None],
 ) -> dict[str, int]:
     """How many steps fit, as measured the first time and kept in FOLDER/steps.json."""
     file = plan.folder / "steps.json"
@@ -163,7 +183,7 @@ def _steps(
             root=plan.root, config=run.config, seconds=plan.seconds(run), device=plan.device
         )
         for run in plan.runs
-        for key in [_alike(plan, run)]
+        for key in [_alike(plan, named, run)]
         if key not in known
     }
     if missing:
@@ -176,13 +196,12 @@ def _steps(
     return known
 
 
-def _alike(plan: Plan, run: Run) -> str:
+def _alike(plan: Plan, named: Callable[[TrainConfig], str], run: Run) -> str:
     """The same for settings of which a step costs the same."""
     alike = replace(
         run.config, steps=1, seed=0, goal_objects=True, soft_labels=False, scene_share=1.0
     )
-    name = checkpoint_id(Dataset.open(plan.root), alike)
-    return f"{name} in {plan.seconds(run):g} s, {plan.device}"
+    return f"{named(alike)} in {plan.seconds(run):g} s, {plan.device}"
 
 
 def _settled(plan: Plan, run: Run, steps: int) -> TrainConfig:
@@ -190,6 +209,7 @@ def _settled(plan: Plan, run: Run, steps: int) -> TrainConfig:
     config = replace(
         run.config,
         steps=steps,
+        validation_goals=plan.goals,
         validations=VALIDATIONS,
         save_every=max(1, round(steps * SAVED / plan.seconds(run))),
     )
@@ -217,7 +237,7 @@ class Training:
         path = train(plan.root, self.config, progress=progress)
         model, meta = load_checkpoint(path, self.config.device)
         with on_threads(self.config.threads):
-            test = metrics_of(_judge(dataset, model, meta, self.config, plan.test_scenes))
+            test = metrics_of(_judge(dataset, model, meta, self.config, plan.goals))
         file = plan.row_file(meta["checkpoint_id"])
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as temporary:
@@ -255,16 +275,16 @@ def _judge(
     model: Any,
     meta: Mapping[str, Any],
     config: TrainConfig,
-    most: int | None,
+    goals: int,
 ) -> Iterator[Judged]:
     """What a model says of the test scenes, at the offsets that validation chose; it is also
     written into the dataset's predictions, a shard at a time."""
     catalogue = Catalogue.of(dataset, "test", config)
     for shard in catalogue.shards:
-        own = replace(catalogue, shards=(shard,))
+        own = replace(catalogue, shards=(shard,), goals=goals)
         reader = Reader(catalogue=own, config=config, pictures=not model.told)
         rows: list[Row] = []
-        for one in judged(model, reader.whole(most=most), meta["offsets"]):
+        for one in judged(model, reader.whole(), meta["offsets"]):
             rows += _predictions(one, meta)
             yield one
         dataset.write_rows(
