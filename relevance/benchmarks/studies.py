@@ -397,5 +397,6 @@ def _plots(study: str, rows: Sequence[Row], scored: Sequence[Scored]) -> Iterato
 
 
 def _line_of(row: Row, by: str) -> str:
-    goals = f"{row['scene_goals'] or 'all'} goals of each"
+    goals = {0: "all goals", 1: "1 goal"}.get(row["scene_goals"], f"{row['scene_goals']} goals")
+    goals = f"{goals} of each"
     return f"{row['body']}, {goals}" + (f", {row['scenes']:,} scenes" if by != "scenes" else "")
