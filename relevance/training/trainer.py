@@ -2,6 +2,8 @@
 
 What a step learns from is a pure function of (seed, step), so a run that was killed and started
 again ends with the same weights as one that was not; there is no sampler state to save.
+
+Shape suffixes: B scenes and G goals of a batch, N objects (padded).
 """
 
 from __future__ import annotations
@@ -416,10 +418,7 @@ def measure(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judged:
-    """What a model says of the goals of a predicate in a batch, offset included.
-
-    Shape suffixes: B scenes, G goals, N objects.
-    """
+    """What a model says of the goals of a predicate in a batch, offset included."""
 
     batch: Batch
     predicate: Predicate
