@@ -3,14 +3,12 @@
 import csv
 import json
 import math
-import shutil
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import contents, small_dataset
+from conftest import small_dataset
 
 from relevance.benchmarks import (
     MAX_EDGE,
@@ -27,7 +25,6 @@ from relevance.benchmarks import (
     save,
 )
 from relevance.benchmarks.completeness import Compared, completeness_table
-from relevance.benchmarks.learning import RECIPES
 from relevance.benchmarks.runs import Measured, interval, ratio, share
 from relevance.benchmarks.stability import (
     JITTER,
@@ -41,11 +38,9 @@ from relevance.benchmarks.stability import (
 from relevance.benchmarks.versus import ROOT
 from relevance.cli import main
 from relevance.cli.bench import hand_over
-from relevance.evaluation import NETWORK, accuracy_table, predict, read_predictions
 from relevance.planner import Counts, PlannerConfig, PlanResult, Seconds, plan
 from relevance.scene import Box, Scene, goal_holds, read_scenes
-from relevance.store import Dataset
-from relevance.training import steps_within
+from relevance.training import RECIPES, steps_within
 
 RED, GREEN, BLUE = (0.8, 0.1, 0.1), (0.1, 0.7, 0.1), (0.1, 0.1, 0.8)
 
@@ -435,44 +430,6 @@ def test_training_is_measured_for_every_reading(tmp_path, capsys):
     assert "--bodies cnn: expected one of geometry, glimpse" in capsys.readouterr().err
 
 
-def test_learning_is_measured_by_both_recipes_and_nothing_is_trained_twice(tmp_path, capsys):
-    root = Path(shutil.copytree(small_dataset(), tmp_path / "dataset"))
-    out = tmp_path / "out"
-    command = ["bench", "training", "--dataset", str(root), "--bodies", "geometry"]
-    command += ["--minutes", "0.001", "--seconds", "0", "--out", str(out)]
-    assert main(command) == 0
-    assert "geometry is told the true poses" not in capsys.readouterr().out  # nobody else is there
-    with (out / "learning.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [(row["recipe"], row["family"]) for row in rows] == [
-        (recipe, family) for recipe in ("fair", "paper") for family in ("same-plane", "on")
-    ]
-    stored = Dataset.open(root)
-    configs = {
-        row["checkpoint_id"]: json.loads(row["config"]) for row in stored.read_rows("checkpoints")
-    }
-    assert len(configs) == 3  # the paper's recipe has a network for each family
-    assert [configs[row["checkpoint_id"]]["steps"] for row in rows] == [
-        int(row["steps"]) for row in rows
-    ]
-    assert [configs[row["checkpoint_id"]]["families"] for row in rows] == [
-        [], [], ["same-plane"], ["on"],
-    ]  # fmt: skip
-    # The figures are those that `relevance evaluate` finds.
-    fair = rows[0]["checkpoint_id"]
-    predict(root, root / "checkpoints" / f"{fair}.pt")
-    judged = accuracy_table(read_predictions(stored, fair).queries())
-    for row, found in zip(rows, (t for t in judged if t["judge"] == NETWORK), strict=False):
-        for name in ("true_relevant", "true_irrelevant", "total", "base_rate"):
-            if row[name]:  # without a relevant object there is none
-                assert float(row[name]) == pytest.approx(found[name]), name
-    before = contents(root / "checkpoints")
-    assert main(command) == 0
-    assert contents(root / "checkpoints") == before
-    assert main([*command, "--recipes", "soup"]) == 2
-    assert "--recipes soup: expected one of fair, paper" in capsys.readouterr().err
-
-
 def test_steps_within_no_time_are_one_round():
     found = {
         recipe: [steps_within(small_dataset(), network, 0.0) for network in networks("geometry")]
@@ -481,7 +438,9 @@ def test_steps_within_no_time_are_one_round():
     shared = [2]  # the same-plane predicates look together, then `on` does
     assert found == {
         "fair": shared,
-        "paper": [4, 1],
-        "fair-no-goal-objects": shared,
-        "fair-soft-labels": shared,
+        "fair, alone": [1, 1],
+        "bare": [4, 1],
+        "long": shared,
+        "fair, no goal objects": shared,
+        "fair, soft labels": shared,
     }

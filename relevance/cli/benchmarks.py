@@ -20,8 +20,6 @@ Part = Literal["making", "reading", "queries", "crashes"]
 PARTS: tuple[Part, ...] = ("making", "reading", "queries", "crashes")
 OptionalSeed = Annotated[int | None, tyro.conf.arg(metavar="N")]
 Bodies = Annotated[tuple[str, ...], tyro.conf.arg(metavar="BODY")]
-Recipes = Annotated[tuple[str, ...], tyro.conf.arg(metavar="RECIPE")]
-Seeds = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N")]
 Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")]
 Sizes = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N")]
 EVERY, SHARE = 120.0, 0.05
@@ -184,10 +182,6 @@ def _training(_: Preset) -> Callable[..., int]:
         seconds: float = 2.0,
         device: str = TrainConfig().device,
         bfloat16: Literal["auto", "on", "off"] = TrainConfig().bfloat16,
-        dataset: OptionalFolder = None,
-        recipes: Recipes = ("fair", "paper"),
-        minutes: float = 10.0,
-        seeds: Seeds = (0,),
         out: OptionalFolder = None,
     ) -> int:
         """Measure how fast every body trains and looks, on made-up pictures.
@@ -196,11 +190,7 @@ def _training(_: Preset) -> Callable[..., int]:
         the body can share it, and with an encoding for every query, as in the paper. On a CPU
         times are those of one core.
 
-        With --dataset: how much every body learns in equal time of one core, of sizes that it can
-        train, by each recipe; the paper's shares the time between a network for each family. A
-        few steps say how many fit. Time is the processor's, of all steps and of reading for them;
-        what is before and after them (validation) is not in it. Checkpoints stay in the dataset:
-        what is there already is not trained again, and a killed run goes on.
+        (`relevance study DATASET bodies` says what every body learns in equal time.)
 
         Args:
             sizes: Widths that a CPU can train, the paper's, or both.
@@ -212,14 +202,8 @@ def _training(_: Preset) -> Callable[..., int]:
             seconds: How long each of a body's three measurements goes on.
             device: Where; auto is the accelerator if there is one.
             bfloat16: As of `relevance train`.
-            dataset: A labelled dataset to learn from, on the CPU.
-            recipes: With --dataset: fair, paper, fair-no-goal-objects (subject and reference are
-                left out of the loss), fair-soft-labels.
-            minutes: With --dataset: time of one core for each body and recipe.
-            seeds: With --dataset: of weights and order.
             out: Folder for the table's rows as CSV; data/bench/training when not given.
         """
-        from relevance.benchmarks.learning import RECIPES, learned, learning_runs
         from relevance.benchmarks.training import measure_training
         from relevance.models import BODIES, unequal
 
@@ -227,43 +211,22 @@ def _training(_: Preset) -> Callable[..., int]:
             at_least(f"--{flag}", count, 1)
         at_least("--objects", objects, 3)
         at_least("--seconds", seconds, 0)
-        at_least("--minutes", minutes, 0)
-        for seed in seeds:
-            at_least("--seeds", seed, 0, 2**31)
         for body in bodies:
             one_of("--bodies", body, BODIES)
-        for recipe in recipes:
-            one_of("--recipes", recipe, RECIPES)
         folder = out or Path("data/bench/training")
         folder.mkdir(parents=True, exist_ok=True)
-        if dataset:
-            rows, measured = [], learned([], minutes)
-            for name, run in learning_runs(
-                dataset,
+        with bar("bodies") as progress:
+            measured = measure_training(
+                TrainConfig(device=device, bfloat16=bfloat16),
+                sizes=sizes,
                 bodies=bodies,
-                recipes=recipes,
-                seeds=seeds,
-                minutes=minutes,
+                scenes=scenes,
+                goals=goals,
+                objects=objects,
+                queries=queries,
                 seconds=seconds,
-                folder=folder,
-            ):
-                with bar(name) as progress:
-                    rows += run(progress)
-                measured = learned(rows, minutes)
-                write(measured, folder)
-        else:
-            with bar("bodies") as progress:
-                measured = measure_training(
-                    TrainConfig(device=device, bfloat16=bfloat16),
-                    sizes=sizes,
-                    bodies=bodies,
-                    scenes=scenes,
-                    goals=goals,
-                    objects=objects,
-                    queries=queries,
-                    seconds=seconds,
-                    progress=progress,
-                )
+                progress=progress,
+            )
         hand_over(measured, folder)
         for line in unequal(bodies or BODIES):
             print(line)
@@ -302,11 +265,10 @@ COMMANDS = {
     ),
     "bench training": Command(
         make=_training,
-        about="how fast every body trains and looks, how much it learns in equal time",
+        about="how fast every body trains and looks",
         examples=(
             "relevance bench training",
             "relevance bench training --sizes paper --device cuda --scenes 16 --seconds 20",
-            "relevance bench training --dataset data/demo --minutes 10",
         ),
     ),
 }

@@ -15,6 +15,7 @@ from relevance.cli import (
     predicting,
     running,
     sharing,
+    studies,
     viewing,
 )
 from relevance.cli.arguments import Command
@@ -24,6 +25,7 @@ COMMANDS: dict[str, Command] = {
     for group in (
         making,
         learning,
+        studies,
         champions,
         planning,
         viewing,

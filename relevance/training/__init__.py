@@ -38,10 +38,14 @@ from relevance.training.reading import Reader, TrainingError
 from relevance.training.settings import TRAINER_VERSION, TrainConfig
 from relevance.training.shipping import ship
 from relevance.training.speed import Speed, measure_speed
+from relevance.training.studies import RECIPES, STUDIES, Run, Study
+from relevance.training.studying import Plan, run_study
 from relevance.training.trainer import Trainer, measure, train, use_bfloat16
 
 __all__ = [
     "CHECKPOINT_VERSION",
+    "RECIPES",
+    "STUDIES",
     "TRAINER_VERSION",
     "Answer",
     "Batch",
@@ -49,9 +53,12 @@ __all__ = [
     "CheckpointError",
     "Example",
     "Looks",
+    "Plan",
     "Ranks",
     "Reader",
+    "Run",
     "Speed",
+    "Study",
     "TrainConfig",
     "Trainer",
     "TrainingError",
@@ -69,6 +76,7 @@ __all__ = [
     "pick_device",
     "polling",
     "relevance_loss",
+    "run_study",
     "save_checkpoint",
     "ship",
     "shipped",

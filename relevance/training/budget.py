@@ -16,18 +16,18 @@ _SHARE = 0.02
 """Part of the time that is spent on measuring, beyond the first round."""
 
 
-def one_core(config: TrainConfig) -> TrainConfig:
+def one_core(config: TrainConfig, device: str = "cpu") -> TrainConfig:
     """The same on one thread that also reads, so that a process' time is all there is to count."""
-    return replace(config, device="cpu", threads=1, workers=0)
+    return replace(config, device=device, threads=1, workers=0)
 
 
-def steps_within(root: str | Path, config: TrainConfig, seconds: float) -> int:
+def steps_within(root: str | Path, config: TrainConfig, seconds: float, device: str = "cpu") -> int:
     """Steps of these settings that one core takes in so many seconds; those of `config` mean
     nothing. Reading is in, what comes before the first step and after the last one is not.
 
     The first round of turns fills what scenes are drawn from; it is paid once.
     """
-    config = one_core(replace(config, steps=10**9))
+    config = one_core(replace(config, steps=10**9), device)
     catalogue = Catalogue.of(Dataset.open(root), "train", config)
     turns = len(catalogue.groups if config.share_encodings else catalogue.predicates)
     with on_threads(1):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 from relevance.scene import PREDICATES, Predicate
 from relevance.store import Dataset, DatasetError, Files, locate
@@ -24,6 +25,8 @@ class Shard:
     number: int
     family: str
     """The kind of its scenes."""
+    scenes: int
+    """How many it has."""
     labels: Mapping[str, tuple[str, str]]
     """By predicate: the file and its hash."""
 
@@ -38,6 +41,8 @@ class Catalogue:
     ambiguous: bool
     soft: bool
     """Whether answers are shares of the sets that tie."""
+    goals: int
+    """Most goals of a scene and predicate: those whose plans have the first ids; all with 0."""
     shards: tuple[Shard, ...]
     groups: tuple[tuple[Predicate, ...], ...]
     """The predicates with a label, those that look at scenes together beside each other."""
@@ -53,28 +58,42 @@ class Catalogue:
         objects than a mask can tell apart.
         """
         one_labelling(dataset, split, config.policy)
+        learning = split == "train"
+        most = {"train": config.scene_goals, "validation": config.validation_goals}
+        goals = most.get(split, 0)
         files: dict[int, dict[str, tuple[str, str]]] = {}
         for file in dataset.files_under("labels", config.policy, split=split):
             keys = dataset.file_keys(file)
             mark = str(file), dataset.metadata(file)["sha256"]
             files.setdefault(keys["shard"], {})[keys["predicate"]] = mark
-        learned = """
-            from labels left join shard_families using (split, shard)
-            where split = $split and policy = $policy and ($ties or not ambiguous)
-                and ($all or predicate in (select unnest($names::varchar[])))
-                and ($every or family in (select unnest($families::varchar[])))
+        limit = "dense_rank() over (partition by scene_id, predicate order by plan_id)"
+        learned = f"""
+            from (
+                select shard, scene_id, predicate, is_goal_object
+                from labels
+                where split = $split and policy = $policy and ($ties or not ambiguous)
+                    and ($all or predicate in (select unnest($names::varchar[])))
+                    and shard in (select unnest($shards::integer[]))
+                {f"qualify {limit} <= {goals}" if goals else ""}
+            )
         """
-        asked = {
-            "split": split, "policy": config.policy, "ties": config.ambiguous,
-            "every": not config.families, "families": list(config.families),
-        }  # fmt: skip
-        names = ("labels", "scenes", "shard_families")
+        names = ("labels", "scenes")
         with dataset.connect(policy=config.policy, names=names) as connection:
             scenes = connection.execute(
-                "select shard, any_value(family), max(n_objects) from scenes where split = ? "
-                "group by shard order by shard",
+                "select shard, any_value(family), count(*), max(n_objects) from scenes "
+                "where split = ? group by shard order by shard",
                 [split],
             ).fetchall()
+            listed = [
+                Shard(number=number, family=family, scenes=count, labels=files[number])
+                for number, family, count, _ in scenes
+                if number in files and (not config.families or family in config.families)
+            ]
+            shards = _share(listed, config.scene_share) if learning else listed
+            asked = {
+                "split": split, "policy": config.policy, "ties": config.ambiguous,
+                "shards": [shard.number for shard in shards],
+            }  # fmt: skip
             some = {"all": not config.predicates, "names": list(config.predicates)}
             found = connection.execute(f"select distinct predicate {learned}", asked | some)
             names = {name for (name,) in found.fetchall()}
@@ -89,7 +108,7 @@ class Catalogue:
                 ).fetchall()
                 for group in groups
             ]
-        for shard, _, most in scenes:
+        for shard, _, _, most in scenes:
             if most > MOST_OBJECTS:
                 raise DatasetError(
                     f"{dataset.path}: shard {shard} of split {split} has a scene of {most} "
@@ -100,12 +119,9 @@ class Catalogue:
             split=split,
             policy=config.policy,
             ambiguous=config.ambiguous,
-            soft=config.soft_labels and split == "train",
-            shards=tuple(
-                Shard(number=number, family=family, labels=files[number])
-                for number, family, _ in scenes
-                if number in files and (not config.families or family in config.families)
-            ),
+            soft=config.soft_labels and learning,
+            goals=goals,
+            shards=tuple(shards),
             groups=tuple(groups),
             counts=tuple(map(dict, counts)),
         )
@@ -114,6 +130,11 @@ class Catalogue:
     def predicates(self) -> tuple[Predicate, ...]:
         """Those with a label, in the order of a round."""
         return tuple(predicate for group in self.groups for predicate in group)
+
+    def some(self, scenes: int) -> Self:
+        """With the first shards of each family alone that have so many scenes together, and a goal
+        of each scene and predicate: to be read whole."""
+        return replace(self, shards=tuple(_first(self.shards, lambda _: scenes)), goals=1)
 
     def read(self, shard: Shard, predicates: Sequence[Predicate]) -> Iterator[Example]:
         """The examples of a shard that have a label of one of the predicates, in stored order.
@@ -152,9 +173,14 @@ class Catalogue:
         asked = ("subject", "reference", "query", "relevant")
         columns = [rows.column(name).to_pylist() for name in (*names, *asked)]
         sets = self._sets(dataset, shard, predicate) if self.soft else {}
-        for scene, plan, policy, ambiguous, *answer in zip(*columns, strict=True):
-            if policy == self.policy and (self.ambiguous or not ambiguous):
-                subject, reference, query, relevant = answer
+        found = [
+            (scene, plan, *answer)
+            for scene, plan, policy, ambiguous, *answer in zip(*columns, strict=True)
+            if policy == self.policy and (self.ambiguous or not ambiguous)
+        ]
+        kept = _first_plans(found, self.goals) if self.goals else None
+        for scene, plan, subject, reference, query, relevant in found:
+            if kept is None or plan in kept:
                 relevant = target(query, relevant, sets.get(plan, ()))
                 yield scene, Answer(subject, reference, query, relevant)
 
@@ -163,6 +189,33 @@ class Catalogue:
     ) -> dict[str, set[frozenset[str]]]:
         where = {"split": self.split, "shard": shard.number, "predicate": predicate.name}
         return tied_sets(dataset.read_rows("plans", **where))
+
+
+def _share(shards: Sequence[Shard], share: float) -> list[Shard]:
+    """The first shards of each family that have that share of its scenes, or a little more."""
+    total: Counter[str] = Counter()
+    for shard in shards:
+        total[shard.family] += shard.scenes
+    return _first(shards, lambda family: share * total[family])
+
+
+def _first(shards: Sequence[Shard], enough: Callable[[str], float]) -> list[Shard]:
+    """The shards of each family up to that with which it has enough scenes."""
+    before: Counter[str] = Counter()
+    kept = []
+    for shard in shards:
+        if before[shard.family] < enough(shard.family):
+            kept.append(shard)
+        before[shard.family] += shard.scenes
+    return kept
+
+
+def _first_plans(rows: Sequence[tuple[Any, ...]], most: int) -> set[str]:
+    """Of the plans of each scene, those with the first ids, which are hashes: any ones."""
+    plans: dict[str, set[str]] = {}
+    for scene, plan, *_ in rows:
+        plans.setdefault(scene, set()).add(plan)
+    return {plan for some in plans.values() for plan in sorted(some)[:most]}
 
 
 def one_labelling(dataset: Files, split: str, policy: str) -> None:

@@ -41,7 +41,7 @@ from relevance.scene import PREDICATES
 from relevance.store import Dataset
 from relevance.training.settings import TrainConfig
 
-STATE_VERSION = 2
+STATE_VERSION = 3
 """Version of the files of unfinished runs."""
 SAME = 3e-5
 """How far scores of a graph may be from those in torch, as a share of the largest."""
@@ -70,7 +70,12 @@ def device_name(device: torch.device) -> str:
 
 def checkpoint_id(dataset: Dataset, config: TrainConfig) -> str:
     """Name of what these settings make of this data: labels of their policy, training split."""
-    return f"{config.model.body}-{content_hash([config.content_hash, data_hash(dataset, config)])}"
+    return id_of(config, data_hash(dataset, config))
+
+
+def id_of(config: TrainConfig, data: str) -> str:
+    """The same for data of a known hash."""
+    return f"{config.model.body}-{content_hash([config.content_hash, data])}"
 
 
 def data_hash(dataset: Dataset, config: TrainConfig) -> str:

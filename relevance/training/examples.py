@@ -71,6 +71,8 @@ class Batch:
     """Ids of the scenes, B."""
     families: tuple[str, ...] = ()
     """What kinds of scenes they are, B."""
+    objects: tuple[tuple[str, ...], ...] = ()
+    """Names of their objects, B."""
     geometry: Tensor
     """(B, N, GEOMETRY)."""
     turns: tuple[tuple[Predicate, Tensor, Tensor, Tensor], ...]
@@ -103,6 +105,7 @@ def _numbers(batch: Batch, change: Callable[[Any], Any]) -> dict[str, Any]:
         "cells": change(batch.cells),
         "names": batch.names,
         "families": batch.families,
+        "objects": batch.objects,
         "geometry": change(batch.geometry),
         "turns": tuple((turn[0], *map(change, turn[1:])) for turn in batch.turns),
     }
@@ -138,6 +141,7 @@ def batch_of(
         cells=cells,
         names=tuple(example.name for example in examples),
         families=tuple(example.family for example in examples),
+        objects=tuple(tuple(scene.names) for scene in scenes),
         geometry=torch.from_numpy(geometry),
         turns=tuple((p, *_goals(examples, scenes, p, most)) for p in predicates),
     )

@@ -59,6 +59,14 @@ class Ranks:
             distributed.all_gather_object(found, names)
         return [name for own in found for name in own]
 
+    def totals(self, counts: Sequence[int]) -> list[int]:
+        """Each count, summed over the processes."""
+        found: list[Sequence[int]] = [counts]
+        if self.count > 1:
+            found = [[]] * self.count
+            distributed.all_gather_object(found, counts)
+        return [sum(own) for own in zip(*found, strict=True)]
+
     def wait(self) -> None:
         """Wait until all are here."""
         if self.count > 1:

@@ -92,13 +92,15 @@ class Reader:
                 found.append(replace(batch, turns=batch.turns[turns]))
             yield found
 
-    def whole(self, scenes: int = 16) -> Iterator[Batch]:
-        """Every labelled scene once, in stored order, with all its goals."""
+    def whole(self, scenes: int = 16, *, most: int | None = None) -> Iterator[Batch]:
+        """Every labelled scene once, in stored order, with all its goals; of each shard the first
+        `most`."""
         stream = chain.from_iterable(
             _cut(
                 group,
                 chain.from_iterable(
-                    self.catalogue.read(shard, group) for shard in self.catalogue.shards
+                    islice(self.catalogue.read(shard, group), most)
+                    for shard in self.catalogue.shards
                 ),
                 scenes,
             )

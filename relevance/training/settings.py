@@ -48,6 +48,11 @@ class TrainConfig:
     four same-plane predicates and another for `on`.)"""
     families: tuple[str, ...] = ()
     """The families of scenes that are learned from; all when empty. (`on` is asked of two.)"""
+    scene_share: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Of each family, the share of the training scenes that is learned from, by whole shards."""
+    scene_goals: Annotated[int, Field(ge=0)] = 0
+    """Of each scene and predicate, the most goals that are learned from, always the same; all
+    with 0."""
     start: str = ""
     """Id of a checkpoint of the dataset whose weights are taken over and stay as they are: only
     heads that it lacks are trained, those of `predicates`."""
@@ -96,6 +101,14 @@ class TrainConfig:
     """CPU threads; 0 leaves torch's choice."""
     save_every: Count = execution(50)
     """Steps between saved states."""
+    validation_goals: Annotated[int, Field(ge=0)] = 0
+    """Of each validation scene and predicate, the most goals that the decision is chosen by; all
+    with 0. (Bodies that look anew for each query take their time.)"""
+    validations: Annotated[int, Field(ge=0)] = execution(0)
+    """How often, evenly over the steps, some validation scenes are judged for the learning curve,
+    by a goal of each predicate; none of it is in the run's times."""
+    validation_scenes: Count = execution(100)
+    """How many of each family that are."""
     workers: Annotated[int, Field(ge=0)] | None = execution(None)
     """Processes that read and decode ahead, for each that trains; none with 0; one beside a CPU,
     more beside an accelerator when not given."""

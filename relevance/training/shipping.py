@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,9 @@ from relevance.store import replacing
 from relevance.training.checkpoints import load_checkpoint, save_checkpoint
 from relevance.training.settings import TrainConfig
 from relevance.training.trainer import train
+
+_EXECUTION = {f.name for f in fields(TrainConfig) if not f.metadata.get("identity", True)}
+"""Settings that say how a model is trained, not which."""
 
 
 def ship(
@@ -92,7 +95,7 @@ def command(config: TrainConfig, root: Path) -> str:
     changed = {
         key: value
         for key, value in dotted(asdict(config)).items()
-        if value != before.get(key) and key not in ("preset", "device", "threads", "model.body")
+        if value != before.get(key) and key not in (*_EXECUTION, "model.body")
     }
     preset = [f"--preset {config.preset}"] if make is not TrainConfig else []
     words = [f"relevance ship {root}", *preset, f"--model.body {config.model.body}"]

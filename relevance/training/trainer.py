@@ -2,6 +2,8 @@
 
 What a step learns from is a pure function of (seed, step), so a run that was killed and started
 again ends with the same weights as one that was not; there is no sampler state to save.
+
+Shape suffixes: B scenes and G goals of a batch, N objects (padded).
 """
 
 from __future__ import annotations
@@ -71,6 +73,13 @@ class Trainer:
         self.history: list[dict[str, float]] = []
         """Loss and its parts, averaged between two entries; each with its step."""
         self._sums: dict[str, float] = {}
+        self.scenes = 0
+        """Scenes that were shown, each time one was."""
+        self.asked: dict[str, int] = {}
+        """By predicate (or family, see `group_of`), queries that were answered: subject and
+        reference left out, repetitions counted."""
+        self.validations: list[dict[str, Any]] = []
+        """What some validation scenes said on the way; each with its step."""
         self.device = ranks.device(pick_device(config.device))
         # Weights are drawn before they move: equal ones on every device.
         learned = trained_predicates(predicates, config)
@@ -142,6 +151,7 @@ class Trainer:
         self.optimizer.step()
         self.done += 1
         self._record(values)
+        self._count(batches)
         return values
 
     def _record(self, values: dict[str, float]) -> None:
@@ -154,6 +164,15 @@ class Trainer:
             self.history.append({"step": float(self.done), **means})
             self._sums = {}
 
+    def _count(self, batches: Sequence[Batch]) -> None:
+        for batch in batches:
+            self.scenes += len(batch.names)
+            for predicate, goals, _, labelled in batch.turns:
+                asked = labelled.sum((1, 2)) - labelled.gather(-1, goals).sum((1, 2))
+                for family, count in zip(batch.families, asked.tolist(), strict=True):
+                    group = group_of(predicate.name, family)
+                    self.asked[group] = self.asked.get(group, 0) + count
+
     def state(self) -> dict[str, Any]:
         """All that the rest of the run depends on."""
         return {
@@ -163,6 +182,9 @@ class Trainer:
             "core_seconds": self.core_seconds,
             "history": self.history,
             "sums": self._sums,
+            "scenes": self.scenes,
+            "asked": self.asked,
+            "validations": self.validations,
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
         }
@@ -174,6 +196,8 @@ class Trainer:
         self.done, self.seconds, self.waited = (state[k] for k in ("done", "seconds", "waited"))
         self.core_seconds = state["core_seconds"]
         self.history, self._sums = list(state["history"]), dict(state["sums"])
+        self.scenes, self.asked = state["scenes"], dict(state["asked"])
+        self.validations = list(state["validations"])
 
 
 def trained_predicates(predicates: Sequence[Predicate], config: TrainConfig) -> list[str]:
@@ -226,6 +250,7 @@ def train(
     with on_threads(config.threads), together() as ranks:
         trainer = Trainer(own, catalogue.predicates, start, ranks)
         run.resume(trainer)
+        validation = Catalogue.of(dataset, "validation", config)
         with closing(reader_for(catalogue, trainer).steps(trainer.done)) as steps:
             while trainer.done < config.steps:
                 try:
@@ -235,10 +260,12 @@ def train(
                     raise
                 if progress and ranks.first:
                     progress(trainer.done, config.steps)
+                if ranks.first and trainer.done in _validated(config):
+                    _validate(trainer, validation)
                 if trainer.done % config.save_every == 0 and trainer.done < config.steps:
                     run.save(trainer)
+        scenes, *asked = ranks.totals([trainer.scenes, *trainer.asked.values()])
         if ranks.first:
-            validation = Catalogue.of(dataset, "validation", config)
             metrics = measure(trainer.model, reader_for(validation, trainer).whole())
             meta = {
                 "checkpoint_id": name,
@@ -256,12 +283,30 @@ def train(
                 "offsets": offsets(metrics, before),
                 "yaws": yaws(dataset),
                 "history": trainer.history,
+                "validations": trainer.validations,
+                "scenes": scenes,
+                "asked": dict(zip(trainer.asked, asked, strict=True)),
             }
             save_checkpoint(path, trainer.model, meta)
             write_row(dataset, path, meta)
             run.path.unlink(missing_ok=True)
         ranks.wait()
     return path
+
+
+def _validated(config: TrainConfig) -> set[int]:
+    """The steps after which the learning curve gets a point; the last one of them."""
+    times = config.validations
+    return {-(-config.steps * time // times) for time in range(1, times + 1)}
+
+
+def _validate(trainer: Trainer, validation: Catalogue) -> None:
+    """Judge some validation scenes: a point of the learning curve."""
+    most = trainer.config.validation_scenes
+    some = reader_for(validation.some(most), trainer)
+    found = measure(trainer.model, some.whole(most=most))
+    queries = {group: its["queries"] for group, its in found.items()}
+    trainer.validations.append({"step": trainer.done, "queries": queries})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -370,10 +415,32 @@ def measure(
     its four predicates; what a predicate is asked in another family than its own stands under
     that family.
     """
+    return metrics_of(judged(model, batches, offsets))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judged:
+    """What a model says of the goals of a predicate in a batch, offset included."""
+
+    batch: Batch
+    predicate: Predicate
+    goals: np.ndarray
+    """(B, G, 2) places of subject and reference."""
+    score: np.ndarray
+    """(B, G, N)."""
+    relevant: np.ndarray
+    labelled: np.ndarray
+    query: np.ndarray
+    """(B, G, N) bool; False for subject and reference."""
+
+
+def judged(
+    model: RelevanceModel, batches: Iterable[Batch], offsets: Mapping[str, float] = {}
+) -> Iterator[Judged]:
+    """Score all goals of the batches, those of the model's predicates."""
     model.eval()
-    pooled: dict[str, list[tuple[np.ndarray, ...]]] = {}
-    with torch.inference_mode():
-        for batch in batches:
+    for batch in batches:
+        with torch.inference_mode():
             drawn = batch.to(model.device)
             encoding = model.encode(drawn.image, drawn.views, drawn.present, drawn.geometry)
             for predicate, goals, relevant, labelled in drawn.turns:
@@ -382,13 +449,23 @@ def measure(
                 score = model.decode(encoding, predicate, goals, labelled)
                 score = score + offsets.get(predicate.name, 0.0)
                 places = torch.arange(score.shape[-1], device=score.device)
-                asked = places[:, None] != goals[..., None, :]
-                arrays = (score, relevant.bool(), labelled, asked.all(-1))
-                for family in set(drawn.families):
-                    own = [i for i, its in enumerate(drawn.families) if its == family]
-                    rows = tuple(array[own].flatten(0, 1).cpu().numpy() for array in arrays)
-                    for name in {group_of(predicate.name, family), family}:
-                        pooled.setdefault(name, []).append(rows)
+                query = (places[:, None] != goals[..., None, :]).all(-1)
+                arrays = (goals, score, relevant.bool(), labelled, query)
+                names = ("goals", "score", "relevant", "labelled", "query")
+                found = {n: a.cpu().numpy() for n, a in zip(names, arrays, strict=True)}
+                yield Judged(batch=batch, predicate=predicate, **found)
+
+
+def metrics_of(found: Iterable[Judged]) -> dict[str, Any]:
+    """Metrics of what a model said, see `measure`."""
+    pooled: dict[str, list[tuple[np.ndarray, ...]]] = {}
+    for one in found:
+        arrays = (one.score, one.relevant, one.labelled, one.query)
+        for family in set(one.batch.families):
+            own = [i for i, its in enumerate(one.batch.families) if its == family]
+            rows = tuple(array[own].reshape(-1, array.shape[-1]) for array in arrays)
+            for name in {group_of(one.predicate.name, family), family}:
+                pooled.setdefault(name, []).append(rows)
     return {name: _metrics(parts) for name, parts in sorted(pooled.items())}
 
 

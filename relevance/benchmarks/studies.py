@@ -1,0 +1,402 @@
+"""What a study found: its runs judged on unseen scenes beside two rules, in tables and pictures.
+
+Shares are of queries (subject and reference left out) at beta = 0, which is what validation chose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from relevance.benchmarks.runs import Measured, Plot
+from relevance.evaluation import JUDGES, NETWORK, RULE, Predictions, read_predictions
+from relevance.metrics import (
+    WIDE,
+    Accuracy,
+    Interval,
+    average_precision,
+    bootstrap,
+    ratio_of_sums,
+)
+from relevance.report import curves
+from relevance.report.paper import Queries, paper
+from relevance.report.style import GROUPS, groups
+from relevance.report.tables import Table
+from relevance.scene import PREDICATES
+from relevance.store import Dataset
+
+NEVER = "always irrelevant"
+EVERY, CLEAR = "all goals", "goals with one answer"
+"""Which goals are judged; the second leaves the ambiguous ones out."""
+STANDS = ("on the subject", "on the reference", "elsewhere")
+"""Where a query stands."""
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scored:
+    """How a run, or a rule, judges one group of test queries."""
+
+    label: str
+    run: str
+    judge: str
+    group: str
+    """A family of scenes, or a predicate."""
+    stands: str
+    """Where the queries stand; anywhere when empty."""
+    goals: str
+    """Which goals are judged."""
+    body: str
+    reading: str
+    recipe: str
+    polling: str
+    seed: int | None
+    parameters: int | None
+    scenes: int | None
+    """What it learned from: scenes, and goals of each and a predicate (0: all)."""
+    scene_goals: int | None
+    steps: int | None
+    core_minutes: float | None
+    scenes_shown: int | None
+    asked: int | None
+    """Queries of this group that it was asked in training, repetitions counted."""
+    of_paper: float | None
+    """The same as a share of the paper's queries."""
+    checkpoint_id: str
+    queries: int
+    base_rate: float
+    true_relevant: float
+    true_irrelevant: float
+    total: float
+    total_low: float
+    total_high: float
+    """95% interval of the total over scenes."""
+    total_at_paper: float | None
+    """The total at the paper's share of relevant queries."""
+    balanced: float
+    average_precision: float
+    tasks_right: float
+    """Share of goals of which every query is judged rightly."""
+
+
+def tabulate(
+    root: Any, study: str, rows: Sequence[Row], progress: Callable[[int, int], None] | None = None
+) -> Measured:
+    """The tables and pictures of a study's rows, as `run_study` gives them."""
+    dataset, scored, pooled = Dataset.open(root), [], {}
+    for number, row in enumerate(rows, 1):
+        queries = read_predictions(dataset, row["checkpoint_id"]).queries()
+        scored += list(_scored(row, queries, {one.group for one in scored}))
+        for family in GROUPS:
+            sums = _by_scene(queries.of(family))
+            pooled.setdefault((row["label"], family), []).append(sums)
+        if progress:
+            progress(number, len(rows))
+    return Measured(
+        name=study,
+        rows=tuple(scored),
+        tables=(
+            _runs_table(study, scored),
+            _means_table(study, scored, pooled),
+            _predicates_table(study, scored),
+            _stands_table(study, scored),
+        ),
+        plots=tuple(_plots(study, rows, scored)),
+    )
+
+
+def _scored(row: Row, queries: Predictions, ruled: set[str]) -> Iterator[Scored]:
+    """Rows of a run, and those of the rules about groups that have none yet."""
+    for group in groups():
+        part = queries.of(group)
+        if not len(part):
+            continue
+        yield from _judged(row, part, group, NETWORK)
+        if group not in ruled:
+            for judge in (RULE, NEVER):
+                yield from _judged(row, part, group, judge)
+
+
+def _judged(row: Row, part: Predictions, group: str, judge: str) -> Iterator[Scored]:
+    yield _figures(row, part, group, judge, EVERY, "")
+    if (~part.ambiguous).any():
+        yield _figures(row, part.where(~part.ambiguous), group, judge, CLEAR, "")
+    for stands in STANDS if group in GROUPS else ():
+        rows = part.where(part.stands == stands)
+        if len(rows):
+            yield _figures(row, rows, group, judge, EVERY, stands)
+
+
+def _figures(
+    row: Row, part: Predictions, group: str, judge: str, goals: str, stands: str
+) -> Scored:
+    score = JUDGES[judge](part)
+    found = Accuracy.of(score, part.relevant, task=part.task)
+    total = _over_scenes([_by_scene(part, score)])
+    network = judge == NETWORK
+    asked = _asked(row, group)
+    about: dict[str, Any] = {
+        name: str(row[name]) if network else ""
+        for name in ("body", "reading", "recipe", "polling", "checkpoint_id")
+    }
+    took: dict[str, Any] = {
+        "seed": row["seed"],
+        "parameters": row["parameters"],
+        "scenes": row["scenes"],
+        "scene_goals": row["scene_goals"],
+        "steps": row["steps"],
+        "core_minutes": row["core_seconds"] / 60,
+        "scenes_shown": row["scenes_shown"],
+        "asked": asked,
+        "of_paper": _of_paper(asked, group),
+    }
+    learned: dict[str, Any] = {name: value if network else None for name, value in took.items()}
+    theirs = None if stands else paper().test.get(group)
+    return Scored(
+        label=row["label"] if network else judge,
+        run=row["run"] if network else judge,
+        judge=judge,
+        group=group,
+        stands=stands,
+        goals=goals,
+        **about,
+        **learned,
+        queries=found.n_rows,
+        base_rate=found.base_rate,
+        true_relevant=found.true_relevant,
+        true_irrelevant=found.true_irrelevant,
+        total=found.total,
+        total_low=total.low,
+        total_high=total.high,
+        total_at_paper=None if theirs is None else at_share(found, theirs),
+        balanced=found.balanced,
+        average_precision=average_precision(score, part.relevant),
+        tasks_right=found.tasks_right,
+    )
+
+
+def at_share(found: Accuracy, theirs: Queries) -> float:
+    """The total if as many of the queries were relevant as theirs are."""
+    return theirs.share * found.true_relevant + (1 - theirs.share) * found.true_irrelevant
+
+
+def _asked(row: Row, group: str) -> int:
+    """What a run was asked in training about a group."""
+    return sum(
+        count
+        for name, count in row["asked"].items()
+        if group == name or (name in PREDICATES and group == PREDICATES[name].family)
+    )
+
+
+def _of_paper(asked: int, group: str) -> float | None:
+    theirs = paper().train.get(group)
+    return None if theirs is None else asked / (theirs.relevant + theirs.irrelevant)
+
+
+Sums = tuple[np.ndarray, np.ndarray]
+"""By scene: queries judged rightly, and all."""
+
+
+def _by_scene(part: Predictions, score: np.ndarray | None = None) -> Sums:
+    right = ((part.score if score is None else score) > 0) == part.relevant
+    _, number = np.unique(part.scene, return_inverse=True)
+    return np.bincount(number, right), np.bincount(number)
+
+
+def _over_scenes(runs: Sequence[Sums]) -> Interval:
+    """The share of queries judged rightly, with the interval that drawing scenes anew gives; of
+    several runs on the same scenes their mean."""
+    right, asked = (np.sum(columns, axis=0) for columns in zip(*runs, strict=True))
+    return bootstrap((right, asked), ratio_of_sums, confidence=WIDE)
+
+
+# --- tables -----------------------------------------------------------------------------------
+
+
+def _runs_table(study: str, scored: Sequence[Scored]) -> Table:
+    clear = {(one.run, one.group): one for one in scored if one.goals == CLEAR}
+    return Table(
+        name="runs",
+        title=f"{study}: every run, queries of unseen scenes, %",
+        columns=(
+            "run", "M", "scenes", "goals", "steps", "core min", "scenes shown", "of the paper's",
+            "scenes of", "true relevant", "true irrelevant", "total", "95% over scenes",
+            "at the paper's rate", "base rate", "balanced", "AP", "all right",
+            "total, one answer", "all right, one answer",
+        ),
+        rows=tuple(
+            (
+                one.run,
+                "-" if one.parameters is None else f"{one.parameters / 1e6:.2f}",
+                _count(one.scenes),
+                "-" if one.scene_goals is None else one.scene_goals or "all",
+                _count(one.steps),
+                "-" if one.core_minutes is None else f"{one.core_minutes:.1f}",
+                _count(one.scenes_shown),
+                "-" if one.of_paper is None else f"{100 * one.of_paper:.3g}",
+                one.group,
+                *map(_percent, (one.true_relevant, one.true_irrelevant, one.total)),
+                f"{_percent(one.total_low)} to {_percent(one.total_high)}",
+                *map(_percent, (one.total_at_paper, one.base_rate, one.balanced)),
+                *map(_percent, (one.average_precision, one.tasks_right)),
+                *map(_percent, _clear(clear.get((one.run, one.group)))),
+            )
+            for one in _of_families(scored)
+        ),
+    )  # fmt: skip
+
+
+def _clear(one: Scored | None) -> tuple[float | None, float | None]:
+    return (None, None) if one is None else (one.total, one.tasks_right)
+
+
+def _means_table(
+    study: str, scored: Sequence[Scored], pooled: Mapping[tuple[str, str], Sequence[Sums]]
+) -> Table:
+    names = (
+        "true_relevant", "true_irrelevant", "total", "total_at_paper", "balanced",
+        "average_precision", "tasks_right",
+    )  # fmt: skip
+    rows = []
+    for (family, label), runs in _together(_of_families(scored)).items():
+        sums = pooled.get((label, family), ())
+        total = _over_scenes(sums) if sums else None
+        rows.append(
+            (
+                family,
+                label,
+                len(runs),
+                *(_mean([getattr(one, name) for one in runs]) for name in names),
+                f"{_percent(total.low)} to {_percent(total.high)}" if total else "-",
+            )
+        )
+    return Table(
+        name="means",
+        title=f"{study}: mean over seeds (range), queries of unseen scenes, %",
+        columns=(
+            "scenes of", "what", "runs", "true relevant", "true irrelevant", "total",
+            "at the paper's rate", "balanced", "AP", "all right", "total, 95% over scenes",
+        ),
+        rows=tuple(rows),
+    )  # fmt: skip
+
+
+def _predicates_table(study: str, scored: Sequence[Scored]) -> Table:
+    rows = [one for one in scored if one.goals == EVERY and not one.stands]
+    rows = [one for one in rows if one.group in PREDICATES]
+    names = ("true_relevant", "true_irrelevant", "total", "total_at_paper", "base_rate")
+    return Table(
+        name="predicates",
+        title=f"{study}: by predicate, mean over seeds (range), %",
+        columns=(
+            "predicate", "what", "runs", "true relevant", "true irrelevant", "total",
+            "at the paper's rate", "base rate",
+        ),
+        rows=tuple(
+            (*key, len(runs), *(_mean([getattr(one, name) for one in runs]) for name in names))
+            for key, runs in _together(rows).items()
+        ),
+    )  # fmt: skip
+
+
+def _stands_table(study: str, scored: Sequence[Scored]) -> Table:
+    names = ("true_relevant", "true_irrelevant", "total", "base_rate", "balanced")
+    rows = []
+    for stands in STANDS:
+        some = [one for one in scored if one.stands == stands and one.group in GROUPS]
+        for (family, label), runs in _together(some).items():
+            figures = (_mean([getattr(one, name) for one in runs]) for name in names)
+            rows.append((family, stands, label, len(runs), runs[0].queries, *figures))
+    return Table(
+        name="stands",
+        title=f"{study}: by where the query stands, mean over seeds (range), %",
+        columns=(
+            "scenes of", "the query stands", "what", "runs", "queries", "true relevant",
+            "true irrelevant", "total", "base rate", "balanced",
+        ),
+        rows=tuple(rows),
+    )  # fmt: skip
+
+
+def _of_families(scored: Sequence[Scored]) -> list[Scored]:
+    """The rows of whole families, family by family, the rules first."""
+    some = [s for s in scored if s.group in GROUPS and s.goals == EVERY and not s.stands]
+    return sorted(some, key=lambda one: (GROUPS.index(one.group), one.judge == NETWORK))
+
+
+def _together(scored: Sequence[Scored]) -> dict[tuple[str, str], list[Scored]]:
+    """Rows by group and label, the groups in order."""
+    found: dict[tuple[str, str], list[Scored]] = {}
+    order = groups()
+    for one in sorted(scored, key=lambda one: (order.index(one.group), one.judge == NETWORK)):
+        found.setdefault((one.group, one.label), []).append(one)
+    return found
+
+
+def _mean(values: Sequence[float | None]) -> str:
+    """The mean of what there is, and its range where there is one."""
+    known = [value for value in values if value is not None and not np.isnan(value)]
+    if not known:
+        return "-"
+    spread = f" ({_percent(min(known))} to {_percent(max(known))})" if len(known) > 1 else ""
+    return f"{_percent(float(np.mean(known)))}{spread}"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None or np.isnan(share) else f"{100 * share:.1f}"
+
+
+def _count(number: int | None) -> str:
+    return "-" if number is None else f"{number:,}"
+
+
+def markdown(tables: Sequence[Table]) -> str:
+    """Tables as Markdown."""
+    parts = []
+    for table in tables:
+        lines = [table.columns, ["---"] * len(table.columns), *table.rows]
+        body = "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+        parts.append(f"### {table.title}\n\n{body}\n")
+    return "\n".join(parts)
+
+
+# --- pictures ---------------------------------------------------------------------------------
+
+
+def _plots(study: str, rows: Sequence[Row], scored: Sequence[Scored]) -> Iterator[Plot]:
+    """Learning curves, a picture each group of runs; then what more data and more time brought."""
+    drawn = [row for row in rows if row["curve"] and row["validations"]]
+    for curve in dict.fromkeys(row["curve"] for row in drawn):
+        mine = [row for row in drawn if row["curve"] == curve]
+        name = "-".join(["learning", *curve.replace(",", "").split()])
+        yield Plot(
+            name=f"{study}-{name}",
+            draw=partial(curves.learning, rows=mine),
+            panels=1 + len(curves.families_of(mine)),
+        )
+    networks = [asdict(one) for one in _of_families(scored) if one.judge == NETWORK]
+    longest = max((row["core_minutes"] for row in networks), default=0.0)
+    for by, title in (("scenes", "scenes to learn from"), ("core_minutes", "minutes of a core")):
+        rows_by = [
+            row | {"line": _line_of(row, by), by: round(row[by], 1)}
+            for row in networks
+            if by != "scenes" or row["core_minutes"] > 0.8 * longest
+        ]
+        if len({row[by] for row in rows_by if row["recipe"] == "long"}) > 2:
+            yield Plot(
+                name=f"{study}-by-{by.replace('_', '-')}",
+                draw=partial(curves.data, rows=rows_by, by=by, title=title),
+                panels=len({row["group"] for row in rows_by}),
+            )
+
+
+def _line_of(row: Row, by: str) -> str:
+    goals = {0: "all goals", 1: "1 goal"}.get(row["scene_goals"], f"{row['scene_goals']} goals")
+    goals = f"{goals} of each"
+    return f"{row['body']}, {goals}" + (f", {row['scenes']:,} scenes" if by != "scenes" else "")
