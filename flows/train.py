@@ -31,10 +31,8 @@ def train_model(root: str, config: TrainConfig, out: str | None) -> str:
 def tune_guide(root: str, checkpoint: str) -> None:
     """Choose when a lazy guide looks, where nobody did and there are tasks to choose on."""
     from relevance import evaluation
-    from relevance.store import Dataset
 
-    if Dataset.open(root).shards("validation") and not evaluation.is_tuned(checkpoint):
-        evaluation.tune(root, checkpoint)
+    evaluation.tune_once(root, checkpoint)
 
 
 @stage()

@@ -35,7 +35,6 @@ NOT_RUN = {
     r"^relevance diff\b": "needs a dataset that was planned anew: tests/test_families.py",
     r"laptop|paper|randomised": "makes much",
     r"data/(mined|with-mined)|--random\b": "needs a model with failures: tests/test_mining.py",
-    r"laptop|paper": "makes much",
     r"^relevance study ": "trains for hours: tests/test_studies.py",
     r" FILE\b|--coverage": "takes a calibration on many scenes: tests/test_coverage.py",
 }

@@ -64,7 +64,8 @@ def _ship(preset: str, body: str | None = None) -> Callable[..., int]:
         name: OptionalName = None,
         config: Annotated[TrainConfig, tyro.conf.arg(name="")] = start,
     ) -> int:
-        """Make a model that comes with the package: train it, halve it, write a page about it.
+        """Make a model that comes with the package: train it, choose when it looks as `lazy`, halve
+        it, write a page about it.
 
         What was trained with these settings on this dataset is taken. Prints the path.
 
@@ -73,8 +74,13 @@ def _ship(preset: str, body: str | None = None) -> Callable[..., int]:
             out: Folder of the models; those of a checkout are in data/models.
             name: What it is called; the body when not given.
         """
-        from relevance.training import ship
+        from relevance.evaluation import tune_once
+        from relevance.training import ship, train
 
+        with bar("steps") as progress:
+            checkpoint = train(dataset, config, progress=progress)
+        with bar("tasks") as progress:
+            tune_once(dataset, checkpoint, progress=progress)
         with bar("steps") as progress:
             path = ship(dataset, config, out, name=name or "", progress=progress)
         print(path)

@@ -60,7 +60,7 @@ from relevance.evaluation.scorer import (
 )
 from relevance.evaluation.scores import scores
 from relevance.evaluation.suites import SUITES, Suite, away, suite_of
-from relevance.evaluation.tuning import Patience, Tuned, TuningConfig, is_tuned, tune
+from relevance.evaluation.tuning import Patience, Tuned, TuningConfig, tune, tune_once
 from relevance.evaluation.working_points import SweptTask, WorkingPoint, saved, swept, working_point
 
 __all__ = [
@@ -113,7 +113,6 @@ __all__ = [
     "fresh_tasks",
     "guided_cost",
     "in_group",
-    "is_tuned",
     "left_out",
     "load_guide",
     "load_scorer",
@@ -138,6 +137,7 @@ __all__ = [
     "summarise",
     "swept",
     "tune",
+    "tune_once",
     "unjudged",
     "with_oracle",
     "working_point",

@@ -135,9 +135,13 @@ def chosen(tried: Sequence[Patience]) -> int:
     return min(one.patience for one in tried if one.work <= NEARLY * least)
 
 
-def is_tuned(checkpoint: str | Path) -> bool:
-    """Whether a patience was chosen for a checkpoint."""
-    return "patience" in read_checkpoint(named(checkpoint)).meta
+def tune_once(
+    root: str | Path, checkpoint: str | Path, *, progress: Progress | None = None
+) -> None:
+    """`tune`, where nobody did and there are tasks to choose on."""
+    tuned = "patience" in read_checkpoint(named(checkpoint)).meta
+    if not tuned and Dataset.open(root).shards("validation"):
+        tune(root, checkpoint, progress=progress)
 
 
 def costs(
