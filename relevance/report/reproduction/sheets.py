@@ -1,0 +1,143 @@
+"""Tables for a page and for files: rows are plain values, columns say how a page shows them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from relevance.report.style import DASH, number, percent, seconds
+from relevance.store import replacing
+
+Row = Mapping[str, Any]
+
+PAPER, OURS, RULE, MISSING = "paper", "ours", "rule", "missing"
+"""Whose row it is (`whose`); `missing` says in `why` what it would take."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """A column as a page shows it."""
+
+    title: str
+    cell: Callable[[Row], str]
+    left: bool = False
+    """Text, not figures."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sheet:
+    """A table with what has to be known of it."""
+
+    name: str
+    """What its files are called."""
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...] = ()
+
+    def write(self, folder: Path) -> None:
+        """NAME.csv, and NAME.json with title and notes; None and what is no number stay empty."""
+        names = list(dict.fromkeys(name for row in self.rows for name in row))
+        text = io.StringIO()
+        writer = csv.DictWriter(text, names, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({name: _plain(value) for name, value in row.items()} for row in self.rows)
+        rows = [{name: _plain(row.get(name)) for name in names} for row in self.rows]
+        whole = {"title": self.title, "notes": list(self.notes), "rows": rows}
+        for kind, content in (
+            ("csv", text.getvalue()),
+            ("json", json.dumps(whole, indent=1, allow_nan=False) + "\n"),
+        ):
+            with replacing(folder / f"{self.name}.{kind}") as temporary:
+                temporary.write_text(content, encoding="utf-8")
+
+    def shown(self, row: Row) -> list[str]:
+        """The cells of a row; of a missing one as far as it is known, then what it would take."""
+        if row["whose"] != MISSING:
+            return [column.cell(row) for column in self.columns]
+        return [column.cell(row) for column in self.columns if column.left]
+
+
+def _plain(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# --- columns ----------------------------------------------------------------------------------
+
+
+def words(title: str, name: str) -> Column:
+    """What a row is called."""
+    return Column(title=title, cell=lambda row: str(row.get(name) or ""), left=True)
+
+
+def shares(title: str, name: str, *, decimals: int = 1) -> Column:
+    """A share in 0..1, by the row's own `decimals` where it has some: the paper's have none."""
+
+    def cell(row: Row) -> str:
+        return percent(row.get(name), row.get("decimals", decimals))
+
+    return Column(title=title, cell=cell)
+
+
+def counts(title: str, name: str) -> Column:
+    """How many."""
+    return Column(title=title, cell=lambda row: number(row.get(name)))
+
+
+def times(title: str, name: str) -> Column:
+    """Seconds, with their interval below."""
+    return Column(title=title, cell=lambda row: _with_ends(row, name, _hundredths))
+
+
+def saved(title: str, name: str) -> Column:
+    """A share of time, with both of its intervals below."""
+    return Column(title=title, cell=lambda row: _with_ends(row, name, _rounded))
+
+
+def _hundredths(value: float | None) -> str:
+    return f"{value:.2f} s" if value is not None and 1 <= value < 100 else seconds(value)
+
+
+def _rounded(value: float | None) -> str:
+    return percent(value, 1).replace("-", "\N{MINUS SIGN}")
+
+
+def _with_ends(row: Row, name: str, shown: Callable[[float | None], str]) -> str:
+    value = row.get(name)
+    text = shown(value)
+    if text == DASH:
+        return DASH
+    ends = [
+        f"{before}{shown(low)} to {shown(high)}"
+        for suffix, before in (("", ""), ("_95", "95%: "))
+        if (low := row.get(f"{name}_low{suffix}")) is not None
+        and (high := row.get(f"{name}_high{suffix}")) is not None
+        and math.isfinite(low)
+    ]
+    return Markup("{}").format(text) + Markup("").join(
+        Markup("<small>{}</small>").format(end) for end in ends
+    )
+
+
+def spread(name: str, narrow: Any, wide: Any) -> dict[str, float]:
+    """The cells of an estimate with its 67% and its 95% interval."""
+    return {
+        name: narrow.value,
+        f"{name}_low": narrow.low,
+        f"{name}_high": narrow.high,
+        f"{name}_low_95": wide.low,
+        f"{name}_high_95": wide.high,
+    }
+
+
+def share_cells(names: Sequence[str], of: Any, prefix: str = "") -> dict[str, float]:
+    """Cells from the attributes of an object."""
+    return {prefix + name: getattr(of, name) for name in names}
