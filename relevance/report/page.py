@@ -18,6 +18,7 @@ from relevance.report import style
 from relevance.report.data import data_section, planner_section
 from relevance.report.gallery import Rows, choose_examples, draw_examples
 from relevance.report.guided import guided_section
+from relevance.report.misses import misses_section
 from relevance.report.network import network_section
 from relevance.report.pages import write_page
 from relevance.report.paper import paper
@@ -70,6 +71,7 @@ def _page(dataset: Dataset, checkpoint_id: str | None, examples: int) -> dict[st
         "planner": planner,
         "model": model,
         "guided": guided,
+        "misses": misses_section(dataset, rows, chosen, policy),
         "examples": pictures,
         "headlines": _headlines(data, planner, model, guided),
         "policy": policy,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 import jinja2
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from relevance.metrics import Interval
 from relevance.report.style import DASH, TIMES, number, percent, seconds
@@ -29,11 +30,17 @@ def write_page(template: str, out: Path, **given: Any) -> Path:
         "times": times,
         "spread": spread,
         "number": number,
+        "code": code,
     }
     page = environment.get_template(template).render(given)
     with replacing(out) as temporary:
         temporary.write_text(page)
     return out
+
+
+def code(text: str) -> Markup:
+    """Text in which what stands in backticks is code."""
+    return Markup(re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(text))))
 
 
 def times(interval: Interval) -> Markup:

@@ -69,7 +69,7 @@ class Paper:
     axes: Mapping[str, tuple[float, float]]
     """Of those figures: ends of `beta`, `share` and `saved`."""
     notes: Mapping[str, tuple[str, ...]]
-    """The setting behind its `data`, `guided`, `bodies` and `beta` figures, and how we read it."""
+    """What to know of `data`, `accuracy`, `times`, `bodies` and `beta`, and how we read it."""
 
     @property
     def seconds(self) -> tuple[float, float]:

@@ -7,25 +7,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
-from relevance.evaluation import read_evaluations, settings
 from relevance.report.gallery import anchor
 from relevance.report.paper import paper
 from relevance.report.plots import Drawing
 from relevance.report.reproduction.models import (
-    GUIDE,
     POINTS,
-    SEARCH,
+    Evidence,
     Model,
-    on_queries,
     our_betas,
     papers_betas,
 )
 from relevance.report.reproduction.sheets import (
     OURS,
+    TRIPLE,
     Sheet,
     counts,
     saved,
@@ -33,7 +30,7 @@ from relevance.report.reproduction.sheets import (
     shares,
     words,
 )
-from relevance.report.reproduction.tables import REMAKE, SHARES, reruns, time_saved
+from relevance.report.reproduction.tables import time_saved
 from relevance.report.style import (
     FAINT,
     GREEN,
@@ -44,7 +41,6 @@ from relevance.report.style import (
     seconds,
 )
 from relevance.report.style import SHARES as COLORS
-from relevance.store import Dataset
 
 PANELS = ("the paper's range", "where ours moves ten points")
 
@@ -65,20 +61,20 @@ class Curves:
         return [row for row in self.rows if row["panel"] == name]
 
 
-def curves(dataset: Dataset, model: Model) -> Curves | None:
+def curves(evidence: Evidence, model: Model) -> Curves | None:
     """Shares from stored scores, time saved from reruns; None without predictions."""
-    predictions = on_queries(dataset, model)
+    predictions = evidence.queries(model, "on")
     if not len(predictions):
         return None
     ranges = dict(zip(PANELS, (papers_betas(), our_betas(predictions)), strict=True))
-    rerun = _rerun(dataset, model, {beta for betas in ranges.values() for beta in betas})
+    rerun = _rerun(evidence, model, {beta for betas in ranges.values() for beta in betas})
     rows = [
         {
             "panel": panel,
             "whose": OURS,
             "checkpoint": model.name,
             "beta": beta,
-            **share_cells(SHARES, predictions.accuracy(beta)),
+            **share_cells(TRIPLE, predictions.accuracy(beta)),
             "false_irrelevant": 1 - predictions.accuracy(beta).true_relevant,
             **(time_saved(rerun[beta]) if rerun else {}),
             **(_theirs(number) if panel == PANELS[0] else {}),
@@ -91,20 +87,19 @@ def curves(dataset: Dataset, model: Model) -> Curves | None:
 
 
 def _rerun(
-    dataset: Dataset, model: Model, betas: set[float]
+    evidence: Evidence, model: Model, betas: set[float]
 ) -> dict[float, list[dict[str, Any]]]:
     """The reruns of the tasks that were rerun at every beta; nothing where there are none."""
-    known = {beta for search, guide, beta in settings(read_evaluations(dataset, model.name))}
-    if not betas <= known:
+    if not betas <= evidence.betas(model):
         return {}
-    found = {beta: reruns(dataset, model, beta, "on") for beta in betas}
+    found = {beta: evidence.reruns(model, beta, "on") for beta in betas}
     common = set.intersection(*({anchor(row) for row in rows} for rows in found.values()))
     every = {beta: [r for r in rows if anchor(r) in common] for beta, rows in found.items()}
     return every if common else {}
 
 
 def _theirs(number: int) -> dict[str, float]:
-    names = (*SHARES, "false_irrelevant", "saved")
+    names = (*TRIPLE, "false_irrelevant", "saved")
     return {f"paper_{name}": paper().curves[name][number] for name in names}
 
 
@@ -119,17 +114,18 @@ def sheet(found: Curves) -> Sheet:
         shares("false irrelevant", "false_irrelevant"),
         shares("the paper's", "paper_false_irrelevant", decimals=0),
         saved("saved, the look not paid", "saved_free"),
-        saved("saved, both solve", "saved"),
-        saved("saved, misses counted", "saved_counted"),
         shares("the paper's", "paper_saved"),
+        saved("saved, the look paid", "saved"),
+        saved("saved, misses counted", "saved_counted"),
         counts("missed", "missed"),
-        counts("tasks", "solvable"),
     )
     return Sheet(
         name=f"beta-{found.model.body}",
         title=f"Figures 7 and 8, on: {found.model.name}",
         columns=columns,
-        rows=tuple(row | {"shown": f"{row['beta']:+.3g}" if row["beta"] else "0"} for row in found.rows),
+        rows=tuple(
+            row | {"shown": f"{row['beta']:+.3g}" if row["beta"] else "0"} for row in found.rows
+        ),
         notes=(*paper().notes["beta"], *_notes(found)),
     )
 
@@ -141,7 +137,7 @@ def _notes(found: Curves) -> list[str]:
         f"Shares are of {found.n_queries} test queries, from stored scores.",
     ]
     if not found.n_tasks:
-        said.append(f"The planner was not rerun at these betas yet; {REMAKE}.")
+        said.append("Not rerun at these betas yet: `relevance reproduce` does that.")
         return said
     first = found.rows[0]
     said.append(
@@ -157,7 +153,9 @@ def _notes(found: Curves) -> list[str]:
 
 def _ends(values: Any) -> str:
     known = sorted(values)
-    low, high = (percent(value, 0).replace("-", "\N{MINUS SIGN}") for value in (known[0], known[-1]))
+    low, high = (
+        percent(value, 0).replace("-", "\N{MINUS SIGN}") for value in (known[0], known[-1])
+    )
     return low if low == high else f"{low} to {high}"
 
 
@@ -218,18 +216,34 @@ def _saved(*axes: Axes, found: Curves) -> None:
         ax.axhline(0, color=FAINT, linewidth=1.2)
         _dress(ax, panel)
         if panel == PANELS[0]:
-            ax.plot(betas, [r["paper_saved"] for r in rows], "o", color=INK, markersize=4.5,
-                    label="time saved, the paper's")
-            ax.plot(betas, [r["paper_false_irrelevant"] for r in rows], "x", color=LOST,
-                    markersize=4.5, label="false irrelevant, the paper's")
+            ax.plot(
+                betas,
+                [r["paper_saved"] for r in rows],
+                "o",
+                color=INK,
+                markersize=4.5,
+                label="time saved, the paper's",
+            )
+            ax.plot(
+                betas,
+                [r["paper_false_irrelevant"] for r in rows],
+                "x",
+                color=LOST,
+                markersize=4.5,
+                label="false irrelevant, the paper's",
+            )
             low, high = paper().axes["saved"]
             ax.set_ylim(low, high)
             _say_outside(ax, {"the look paid": paid, "the look not paid": values})
         else:
             shown = [*values, *lost, *paper().axes["saved"]]
             ax.set_ylim(min(shown) - 0.03, max(shown) + 0.03)
-    axes[0].figure.legend(loc="outside lower center", ncols=3, columnspacing=1.2,
-                          handles=axes[0].get_legend_handles_labels()[0])
+    axes[0].figure.legend(
+        loc="outside lower center",
+        ncols=3,
+        columnspacing=1.2,
+        handles=axes[0].get_legend_handles_labels()[0],
+    )
 
 
 def _say_outside(ax: Axes, lines: Mapping[str, Sequence[float]]) -> None:

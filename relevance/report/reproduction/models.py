@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -14,8 +14,13 @@ import numpy as np
 from relevance.evaluation import (
     EvaluationConfig,
     Predictions,
+    in_group,
+    left_out,
     load_scorer,
+    read_evaluations,
     read_predictions,
+    settings,
+    shown_as,
     unjudged,
 )
 from relevance.models import BODIES
@@ -24,7 +29,7 @@ from relevance.report.paper import paper
 from relevance.scene import PREDICATES
 from relevance.store import Dataset
 
-GUIDE, SEARCH = "prune", "tree"
+WAY = SEARCH, GUIDE = "tree", "prune"
 """The paper's: leave out what the network calls irrelevant, in an uninformed search."""
 TRANSFORMER = "vit"
 POINTS = 0.1
@@ -133,17 +138,58 @@ def compared(models: Sequence[Model], family: str) -> list[Model]:
     return list({model.name: model for model in found if model}.values())
 
 
+# --- what is known of them ---------------------------------------------------------------------
+
+
+class Evidence:
+    """What a dataset holds of some of its checkpoints, each thing read once."""
+
+    def __init__(self, dataset: Dataset, given: Sequence[str | Path] = ()) -> None:
+        self.dataset = dataset
+        self.models = models_of(dataset, given)
+        self._predictions: dict[str, Predictions] = {}
+        self._reruns: dict[str, dict[tuple[str, str, float], list[dict[str, Any]]]] = {}
+
+    def queries(self, model: Model, group: str = "all") -> Predictions:
+        """Its predictions for the test queries of a predicate or family."""
+        if model.name not in self._predictions:
+            self._predictions[model.name] = read_predictions(self.dataset, model.name).queries()
+        return self._predictions[model.name].of(group)
+
+    def betas(self, model: Model) -> set[float]:
+        """Those at which the planner was rerun in the paper's way."""
+        return {b for search, guide, b in self._settings(model) if (search, guide) == WAY}
+
+    def reruns(self, model: Model, beta: float, group: str) -> list[dict[str, Any]]:
+        """The rows of `evaluations` that the paper's way of guiding gave at a beta."""
+        rows = self._settings(model).get((*WAY, beta), [])
+        return [row for row in rows if in_group(shown_as(row), group)]
+
+    def _settings(self, model: Model) -> dict[tuple[str, str, float], list[dict[str, Any]]]:
+        if model.name not in self._reruns:
+            self._reruns[model.name] = settings(read_evaluations(self.dataset, model.name))
+        return self._reruns[model.name]
+
+    def warnings(self, models: Iterable[Model]) -> list[str]:
+        """What a reader should know of the predictions and reruns of some."""
+        return [
+            f"{model.name}: {line}."
+            for model in models
+            for line in (
+                *unjudged(self.dataset, model.name),
+                *left_out(self.dataset, model.name),
+                *([model.trouble] if model.trouble else []),
+            )
+        ]
+
+
 # --- what is asked of them ---------------------------------------------------------------------
 
 
 def is_scored(dataset: Dataset, model: Model) -> bool:
     """Whether its predictions on the test split are there, and those of the present labels."""
-    return bool(len(read_predictions(dataset, model.name))) and not unjudged(dataset, model.name)
-
-
-def on_queries(dataset: Dataset, model: Model) -> Predictions:
-    """Its test queries of `on`, in scenes of that family."""
-    return read_predictions(dataset, model.name).queries().of("on")
+    files = dataset.files("predictions", name=model.name, split="test")
+    return bool(files) and not unjudged(dataset, model.name)
 
 
 def papers_betas() -> tuple[float, ...]:
@@ -167,8 +213,11 @@ def our_betas(predictions: Predictions) -> tuple[float, ...]:
 def rerun_config(dataset: Dataset, model: Model, start: EvaluationConfig) -> EvaluationConfig:
     """The settings of the reruns that the tables and figures need of a scored model, and of all
     that `start` asks for besides."""
-    asked = papers_betas() + our_betas(on_queries(dataset, model)) if "on" in model.heads else ()
-    betas = {*start.betas, *asked} - {start.beta}
+    betas = {*start.betas}
+    if "on" in model.heads:
+        scored = read_predictions(dataset, model.name).queries().of("on")
+        betas |= {*papers_betas(), *our_betas(scored)}
     searches = tuple(dict.fromkeys((SEARCH, *start.searches)))
     guides = tuple(dict.fromkeys((GUIDE, *start.guides)))
+    betas -= {start.beta}
     return replace(start, betas=tuple(sorted(betas)), guides=guides, searches=searches)

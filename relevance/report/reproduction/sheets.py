@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ from relevance.store import replacing
 
 Row = Mapping[str, Any]
 
+TRIPLE = ("true_relevant", "true_irrelevant", "total")
+"""The shares that the paper reports of a network."""
 PAPER, OURS, RULE, MISSING = "paper", "ours", "rule", "missing"
 """Whose row it is (`whose`); `missing` says in `why` what it would take."""
 
@@ -59,11 +61,15 @@ class Sheet:
             with replacing(folder / f"{self.name}.{kind}") as temporary:
                 temporary.write_text(content, encoding="utf-8")
 
-    def shown(self, row: Row) -> list[str]:
-        """The cells of a row; of a missing one as far as it is known, then what it would take."""
-        if row["whose"] != MISSING:
-            return [column.cell(row) for column in self.columns]
-        return [column.cell(row) for column in self.columns if column.left]
+    def shown(self) -> Iterator[tuple[Row, list[str]]]:
+        """Rows with their cells: what repeats the first cell above is left blank; a missing row has
+        only its words, and then what it would take."""
+        above = ""
+        for row in self.rows:
+            cells = [c.cell(row) for c in self.columns if c.left or row["whose"] != MISSING]
+            first, *others = cells
+            yield row, ["" if first == above else first, *others]
+            above = first
 
 
 def _plain(value: Any) -> Any:
@@ -85,6 +91,18 @@ def shares(title: str, name: str, *, decimals: int = 1) -> Column:
         return percent(row.get(name), row.get("decimals", decimals))
 
     return Column(title=title, cell=cell)
+
+
+def triple(title: str, prefix: str) -> Column:
+    """True relevant, true irrelevant and total in one cell."""
+
+    def cell(row: Row) -> str:
+        values = [row.get(prefix + name) for name in TRIPLE]
+        if any(value is None for value in values):
+            return DASH
+        return " / ".join(f"{100 * value:.1f}" for value in values if value is not None)
+
+    return Column(title=f"{title}: relevant / irrelevant / total, %", cell=cell)
 
 
 def counts(title: str, name: str) -> Column:

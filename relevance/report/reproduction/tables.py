@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -14,13 +14,6 @@ from relevance.evaluation import (
     RULE,
     Predictions,
     guided_cost,
-    in_group,
-    left_out,
-    read_evaluations,
-    read_predictions,
-    settings,
-    shown_as,
-    unjudged,
 )
 from relevance.metrics import CONFIDENCE, WIDE, Accuracy, Interval, over_groups, ratio_of_sums
 from relevance.models import BODIES, unequal
@@ -30,16 +23,17 @@ from relevance.report.reproduction.models import (
     GUIDE,
     SEARCH,
     TRANSFORMER,
+    Evidence,
     Model,
     best,
     of_family,
-    on_queries,
     transformer,
 )
 from relevance.report.reproduction.sheets import (
     MISSING,
     OURS,
     PAPER,
+    TRIPLE,
     Sheet,
     counts,
     saved,
@@ -47,15 +41,14 @@ from relevance.report.reproduction.sheets import (
     shares,
     spread,
     times,
+    triple,
     words,
 )
-from relevance.report.reproduction.sheets import RULE as RULES_ROW
+from relevance.report.reproduction.sheets import RULE as RULES
 from relevance.report.style import number, percent, seconds
 from relevance.scene import PREDICATES
 from relevance.store import Dataset, DatasetError
 
-SHARES = ("true_relevant", "true_irrelevant", "total")
-REMAKE = "`relevance reproduce` makes them"
 FAMILIES = tuple(dict.fromkeys(PREDICATES[name].family for name in paper().scenes))
 """The paper's."""
 
@@ -77,24 +70,22 @@ def label_distribution(dataset: Dataset) -> Sheet:
                 coalesce(queries - relevant, 0)
             from asked left join label_balance using (family, predicate, split)
             where family in (select unnest(?::varchar[]))
-                and (policy is null or policy = coalesce(?, policy))
             """,
-            [list(FAMILIES), dataset.labelling.policy if dataset.labelling else None],
+            [list(FAMILIES)],
         ).fetchall()
-    names = ("scenes", "goals", "plans", "relevant", "irrelevant")
-    ours = {(row[0], row[1]): dict(zip(names, row[2:], strict=True)) for row in found}
+    ours = {(predicate, split): figures for predicate, split, *figures in found}
     rows: list[dict[str, Any]] = []
     for name in paper().scenes:
-        theirs = {
-            "train": (paper().scenes[name], *paper().train[name]),
-            "test": (paper().test_scenes[name], *paper().test[name]),
-        }
-        rows.append({"predicate": name, "whose": PAPER, "by": "paper"})
-        rows.append({"predicate": name, "whose": OURS, "by": "ours"})
-        for split, figures in theirs.items():
-            rows[-2] |= _balance(split, *figures)
-            here = ours.get((name, split))
-            rows[-1] |= _balance(split, *(here[key] if here else 0 for key in names if key in _OF))
+        theirs: dict[str, Any] = {"predicate": name, "whose": PAPER, "by": "paper"}
+        here: dict[str, Any] = {"predicate": name, "whose": OURS, "by": "ours"}
+        for split, scenes, queries in (
+            ("train", paper().scenes[name], paper().train[name]),
+            ("test", paper().test_scenes[name], paper().test[name]),
+        ):
+            theirs |= _balance(split, scenes, *queries)
+            n_scenes, _, _, *labelled = ours.get((name, split), (0, 0, 0, 0, 0))
+            here |= _balance(split, n_scenes, *labelled)
+        rows += [theirs, here]
     columns = [words("predicate", "predicate"), words("", "by")]
     for split in ("train", "test"):
         columns += [
@@ -108,11 +99,8 @@ def label_distribution(dataset: Dataset) -> Sheet:
         title="Table I: label distribution",
         columns=tuple(columns),
         rows=tuple(rows),
-        notes=(*paper().notes["data"], *_data_notes(dataset, ours)),
+        notes=(*paper().notes["data"], *_data_notes(dataset, list(ours.values()))),
     )
-
-
-_OF = ("scenes", "relevant", "irrelevant")
 
 
 def _balance(split: str, scenes: int, relevant: int, irrelevant: int) -> dict[str, Any]:
@@ -121,11 +109,10 @@ def _balance(split: str, scenes: int, relevant: int, irrelevant: int) -> dict[st
     return {f"{split}_{name}": value for name, value in values.items()}
 
 
-def _data_notes(dataset: Dataset, ours: Mapping[tuple[str, str], Mapping[str, int]]) -> list[str]:
+def _data_notes(dataset: Dataset, ours: Sequence[Sequence[int]]) -> list[str]:
     if not ours:
         return ["No goal was planned yet: `relevance label` plans them."]
-    goals, plans = (sum(of[key] for of in ours.values()) for key in ("goals", "plans"))
-    scenes = sum(of["scenes"] for of in ours.values())
+    scenes, goals, plans = map(sum, list(zip(*ours, strict=True))[:3])
     said = [
         f"Ours: {goals / scenes:.1f} goals of a predicate a scene, of which it is asked; "
         f"{percent(1 - plans / goals)} of the goals have no plan that holds, so no label."
@@ -156,7 +143,10 @@ def _data_notes(dataset: Dataset, ours: Mapping[tuple[str, str], Mapping[str, in
             select count(*), avg((above = 1)::int), avg((carried > 0)::int) from loads
             """
         ).fetchone()
-    boxes = [f"{low} to {high} boxes in {name} ({mean:.1f} on average)" for name, low, high, mean in sizes]
+    boxes = [
+        f"{low} to {high} boxes in {name} ({mean:.1f} on average)"
+        for name, low, high, mean in sizes
+    ]
     said.append(f"Ours: {', '.join(boxes)}.")
     if loads and loads[0]:
         said.append(
@@ -173,83 +163,131 @@ def _data_notes(dataset: Dataset, ours: Mapping[tuple[str, str], Mapping[str, in
 # --- Table II ---------------------------------------------------------------------------------
 
 
-def guided_planning(dataset: Dataset, models: Sequence[Model], beta: float = 0.0) -> Sheet:
-    """Table II: accuracy, and mean planning time without and with the network."""
+def accuracies(evidence: Evidence) -> Sheet:
+    """Table II, first half: how often the ViT and our best are right about a query."""
     rows: list[dict[str, Any]] = []
-    said: list[str] = []
-    chosen: dict[str, Model] = {}
-    for family in FAMILIES:
-        found = {"ViT": transformer(models, family), "our best": best(models, family)}
-        for model in found.values():
-            if model and model.name not in chosen:
-                chosen[model.name] = model
-                said += unjudged(dataset, model.name) + left_out(dataset, model.name)
-        for group in dict.fromkeys((*of_family(family), family)):
-            rows.append({"group": group, "whose": PAPER, "by": "paper", **_theirs(group)})
-            for role, model in found.items():
-                if role == "our best" and model and model == found["ViT"]:
-                    continue
-                rows.append({"group": group, "by": role, **_ours(dataset, model, group, beta)})
-    columns = (
-        words("predicate", "group"),
-        words("", "by"),
-        words("checkpoint", "checkpoint"),
-        shares("true relevant", "true_relevant"),
-        shares("true irrelevant", "true_irrelevant"),
-        shares("total", "total"),
-        shares("the rule's total", "rule"),
-        shares("always irrelevant", "base_rate"),
-        shares("as trained: true relevant", "trained_true_relevant"),
-        shares("true irrelevant", "trained_true_irrelevant"),
-        shares("total", "trained_total"),
-        times("unguided, mean", "unguided"),
-        times("guided, mean", "guided"),
-        times("of it the look", "look"),
-        saved("saved, both solve", "saved"),
-        saved("saved, the look not paid", "saved_free"),
-        counts("tasks that both solve", "both"),
-        counts("missed", "missed"),
-        saved("saved, misses counted", "saved_counted"),
-    )
-    notes = [*paper().notes["guided"], *_guided_notes(dataset, chosen.values(), rows, beta)]
+    for group, whose, model in _lines(evidence):
+        row: dict[str, Any] = {"group": group, "by": whose}
+        if whose == PAPER:
+            base = 1 - paper().test[group].share
+            row |= {"whose": PAPER, "decimals": 0, "base_rate": base}
+            row |= share_cells(TRIPLE, paper().accuracy[group])
+        elif model is None:
+            row |= _none()
+        elif len(part := evidence.queries(model, group)):
+            rule = Accuracy.of(JUDGES[RULE](part), part.relevant).total
+            row |= {"whose": OURS, "checkpoint": model.name, "rule": rule, **_judged(part)}
+        else:
+            row |= {"whose": MISSING, "checkpoint": model.name, "why": _unscored(model)}
+        rows.append(row)
     return Sheet(
-        name="table-2",
-        title="Table II: accuracy and guided planning",
-        columns=columns,
+        name="table-2-accuracy",
+        title="Table II: accuracy",
+        columns=(
+            words("predicate", "group"),
+            words("", "by"),
+            words("checkpoint", "checkpoint"),
+            shares("true relevant", "true_relevant"),
+            shares("true irrelevant", "true_irrelevant"),
+            shares("total", "total"),
+            shares("the rule's total", "rule"),
+            shares("always irrelevant", "base_rate"),
+            triple("as trained", "trained_"),
+        ),
         rows=tuple(rows),
-        notes=(*notes, *dict.fromkeys(said)),
+        notes=(
+            *paper().notes["accuracy"],
+            "Ours: test queries at beta = 0, the decision that validation chose: the checkpoint's "
+            "offset is part of the score, and what is relevant least often is called so less "
+            "often. As trained: without it, which is how the paper's stand. Our best: of the "
+            "checkpoints that look at the picture, the one that is right most often on validation. "
+            "The rule: relevant iff it stands on subject or reference.",
+            *_models_said(_used(evidence)),
+            *evidence.warnings(_used(evidence)),
+        ),
     )
 
 
-def _theirs(group: str) -> dict[str, Any]:
-    accuracy, runtime = paper().accuracy[group], paper().runtime[group]
-    base = 1 - paper().test[group].share
-    row = {**share_cells(SHARES, accuracy), "base_rate": base, "decimals": 0}
-    row |= {"unguided": runtime.unguided, "guided": runtime.guided, "saved": runtime.saved}
+def planning_times(evidence: Evidence) -> Sheet:
+    """Table II, second half: mean planning time without and with the network."""
+    rows: list[dict[str, Any]] = []
+    for group, whose, model in _lines(evidence):
+        row: dict[str, Any] = {"group": group, "by": whose}
+        if whose == PAPER:
+            row |= {"whose": PAPER, **_theirs(group)}
+        elif model is None:
+            row |= _none()
+        elif rerun := evidence.reruns(model, 0.0, group):
+            row |= {"whose": OURS, "checkpoint": model.name, **time_saved(rerun)}
+        else:
+            row |= {"whose": MISSING, "checkpoint": model.name, "why": _idle(model)}
+        rows.append(row)
+    return Sheet(
+        name="table-2-time",
+        title="Table II: planning time",
+        columns=(
+            words("predicate", "group"),
+            words("", "by"),
+            times("unguided, mean", "unguided"),
+            times("guided, mean", "guided"),
+            times("of it the look", "look"),
+            saved("saved", "saved"),
+            saved("saved, the look not paid", "saved_free"),
+            counts("tasks that both solve", "both"),
+            counts("missed", "missed"),
+            saved("saved, misses counted", "saved_counted"),
+        ),
+        rows=tuple(rows),
+        notes=(
+            *paper().notes["times"],
+            f"Ours: guide {GUIDE}, search {SEARCH}, beta = 0; CPU time of one core of this "
+            "machine, a scene looked at anew for each task. Means over the tasks that both solve; "
+            "misses counted: over all that the unguided planner solves, a miss costing the guided "
+            "attempt and then the unguided run. Intervals are 67%, and 95% where it says so, by "
+            "bootstrap over scenes.",
+            "Ours: the tree search is narrower than an uninformed search over all tuples of "
+            "action and object: blockers go to the table, each object moves once, the subject "
+            "last.",
+            *_too_quick(rows),
+        ),
+    )
+
+
+def _lines(evidence: Evidence) -> Iterator[tuple[str, str, Model | None]]:
+    """Predicate or family, whose row it is, and the checkpoint: the paper, the ViT, our best."""
+    for family in FAMILIES:
+        vit, ours = transformer(evidence.models, family), best(evidence.models, family)
+        for group in dict.fromkeys((*of_family(family), family)):
+            yield group, PAPER, None
+            yield group, "ViT", vit
+            if ours != vit:
+                yield group, "our best", ours
+
+
+def _used(evidence: Evidence) -> list[Model]:
+    """The checkpoints of Table II."""
+    used = [model for _, _, model in _lines(evidence) if model]
+    return list({model.name: model for model in used}.values())
+
+
+def _none() -> dict[str, Any]:
+    return {"whose": MISSING, "why": "no checkpoint of it was given, and the dataset has none"}
+
+
+def _unscored(model: Model) -> str:
+    return model.trouble or "no predictions on the test split yet: `relevance reproduce` makes them"
+
+
+def _idle(model: Model) -> str:
+    return model.trouble or "not rerun with the planner yet: `relevance reproduce` does that"
+
+
+def _theirs(group: str) -> dict[str, float]:
+    runtime = paper().runtime[group]
+    row = {"unguided": runtime.unguided, "guided": runtime.guided, "saved": runtime.saved}
     for name, half in zip(("unguided", "guided"), paper().spread.get(group, ()), strict=False):
         row |= {f"{name}_low": row[name] - half, f"{name}_high": row[name] + half}
     return row
-
-
-def _ours(dataset: Dataset, model: Model | None, group: str, beta: float) -> dict[str, Any]:
-    if model is None:
-        what = "no checkpoint of it was given, and the dataset has none"
-        return {"whose": MISSING, "why": what, "checkpoint": ""}
-    row: dict[str, Any] = {"whose": OURS, "checkpoint": model.name}
-    part = read_predictions(dataset, model.name).queries().of(group)
-    if not len(part):
-        return row | {"whose": MISSING, "why": f"no predictions on the test split yet; {REMAKE}"}
-    rule = Accuracy.of(JUDGES[RULE](part), part.relevant)
-    found = part.accuracy(beta)
-    row |= share_cells((*SHARES, "base_rate"), found) | {"rule": rule.total}
-    row |= {"queries": found.n_rows, "goals": found.n_tasks} | _as_trained(part)
-    return row | time_saved(reruns(dataset, model, beta, group))
-
-
-def reruns(dataset: Dataset, model: Model, beta: float, group: str) -> list[dict[str, Any]]:
-    """The rows of `evaluations` that the paper's way of guiding gave at a beta."""
-    rows = settings(read_evaluations(dataset, model.name)).get((SEARCH, GUIDE, beta), [])
-    return [row for row in rows if in_group(shown_as(row), group)]
 
 
 def time_saved(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -298,125 +336,101 @@ def _both_ways(
     return spread(name, of_scenes(confidence=CONFIDENCE), of_scenes(confidence=WIDE))
 
 
-def _guided_notes(
-    dataset: Dataset, models: Any, rows: Sequence[Mapping[str, Any]], beta: float
-) -> list[str]:
-    said = [
-        f"Ours: guide {GUIDE}, search {SEARCH}, beta = {beta:g}, the decision that validation "
-        "chose (the checkpoint's offset is part of the score; as trained: without it, which is how "
-        "the paper's shares stand); CPU time of one core of this "
-        "machine, a scene looked at anew for each task. Intervals are 67%, and 95% where it says "
-        "so, by bootstrap over scenes; a miss costs the guided attempt and then the unguided run.",
-        "Ours: the tree search is narrower than an uninformed search over all tuples of action "
-        "and object: blockers go to the table, each object moves once, the subject last.",
+def _too_quick(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Where a look takes longer than planning, what that means."""
+    return [
+        f"Ours, {row['group']}: planning takes {seconds(row['unguided'])} unguided, less than one "
+        f"look of {row['checkpoint']} ({seconds(row['look'])}), so that no accuracy could make the "
+        "look pay at this size; without it, planning stands against planning."
+        for row in rows
+        if row["whose"] == OURS and row["group"] in FAMILIES and row["look"] > row["unguided"]
     ]
-    solo = [row for row in rows if row.get("whose") == OURS and row["group"] in FAMILIES]
-    for row in solo:
-        if row["both"] and row["look"] > row["unguided"]:
-            said.append(
-                f"Ours, {row['group']} by {row['checkpoint']}: planning takes "
-                f"{seconds(row['unguided'])} unguided, less than one look "
-                f"({seconds(row['look'])}), so no accuracy could make the look pay at this size; "
-                "the column without it is planning against planning."
-            )
-    idle = {row["checkpoint"]: row["group"] for row in solo if not row["tasks"]}
-    said += [f"{name} was not rerun with {GUIDE} yet; {REMAKE}." for name in idle]
-    said += _models_said(models)
-    return said
 
 
-def _models_said(models: Any) -> list[str]:
+def _models_said(models: Sequence[Model]) -> list[str]:
     """What is to be known of the checkpoints of a table."""
-    known = list(models)
     said = [
         f"{m.name}: {m.body}{f' ({m.reading})' if m.reading else ''}, {number(m.steps)} steps in "
         f"{m.train_seconds / 60:.1f} minutes, eta "
         + (", ".join(f"{eta:g} ({family})" for family, eta in m.eta.items()) or "not known")
         + "."
-        for m in known
+        for m in models
     ]
-    return said + [f"{line}." for line in unequal([TRANSFORMER, *(m.body for m in known)])]
+    return said + [f"{line}." for line in unequal([TRANSFORMER, *(m.body for m in models)])]
 
 
 # --- Table III --------------------------------------------------------------------------------
 
 
-def bodies(dataset: Dataset, models: Sequence[Model], beta: float = 0.0) -> Sheet:
+def bodies(evidence: Evidence) -> Sheet:
     """Table III: every body on `on`."""
     rows: list[dict[str, Any]] = [
-        {"body": name, "by": "paper", "whose": PAPER, "decimals": 0, **share_cells(SHARES, of)}
+        {"body": name, "by": "paper", "whose": PAPER, "decimals": 0, **share_cells(TRIPLE, of)}
         for name, of in paper().bodies.items()
     ]
-    able = [model for model in models if "on" in model.heads]
-    judged: dict[str, Predictions] = {m.name: on_queries(dataset, m) for m in able}
-    known = {body: name for name, body in paper().body_names.items()}
-    for body in dict.fromkeys((*known, *(m.body for m in able), *BODIES)):
+    able = [model for model in evidence.models if "on" in model.heads]
+    known = {body: f"{name} ({body})" for name, body in paper().body_names.items()}
+    judged = {model.name: evidence.queries(model, "on") for model in able}
+    for body in dict.fromkeys((*known, *BODIES, *(m.body for m in able))):
+        row = {"body": known.get(body, body), "by": "ours"}
         mine = [model for model in able if model.body == body]
-        title = f"{known[body]} ({body})" if body in known else body
-        if not mine:
-            why = "no checkpoint of it was given, and the dataset has none"
-            rows.append({"body": title, "by": "ours", "whose": MISSING, "why": why})
+        rows += [] if mine else [row | _none()]
         for model in mine:
-            row = {"body": title, "by": model.name, "whose": OURS}
-            part = judged[model.name]
-            if len(part):
-                rows.append(row | _judged(part, part.score, beta) | _as_trained(part))
+            row["by"] = model.name
+            if len(part := judged[model.name]):
+                rows.append({**row, "whose": OURS, **_judged(part)})
             else:
-                why = f"no predictions on the test split yet; {REMAKE}"
-                rows.append(row | {"whose": MISSING, "why": why})
+                rows.append({**row, "whose": MISSING, "why": _unscored(model)})
     scored = next((part for part in judged.values() if len(part)), None)
     if scored is not None:
         for judge in (RULE, NEVER):
-            row = {"body": judge, "by": "no network", "whose": RULES_ROW}
-            rows.append(row | _judged(scored, JUDGES[judge](scored), 0.0))
-    columns = (
-        words("body", "body"),
-        words("", "by"),
-        shares("true relevant", "true_relevant"),
-        shares("true irrelevant", "true_irrelevant"),
-        shares("total", "total"),
-        shares("as trained: true relevant", "trained_true_relevant"),
-        shares("true irrelevant", "trained_true_irrelevant"),
-        shares("total", "trained_total"),
-        shares("on the reference: true relevant", "reference_true_relevant"),
-        shares("true irrelevant", "reference_true_irrelevant"),
-        shares("total", "reference_total"),
-        counts("queries", "queries"),
-    )
-    said = [line for m in able for line in unjudged(dataset, m.name)]
-    notes = [*paper().notes["bodies"], *_bodies_notes(scored, able), *dict.fromkeys(said)]
+            row = {"body": judge, "by": "no network", "whose": RULES}
+            rows.append(row | _shares(scored, JUDGES[judge](scored)))
     return Sheet(
         name="table-3",
         title="Table III: bodies on `on`",
-        columns=columns,
+        columns=(
+            words("body", "body"),
+            words("", "by"),
+            shares("true relevant", "true_relevant"),
+            shares("true irrelevant", "true_irrelevant"),
+            shares("total", "total"),
+            triple("as trained", "trained_"),
+            triple("on the reference", "reference_"),
+            counts("queries", "queries"),
+        ),
         rows=tuple(rows),
-        notes=tuple(notes),
+        notes=(
+            *paper().notes["bodies"],
+            "Ours: queries of test scenes of family on, at beta = 0 with the offset that "
+            "validation chose; as trained: without it, which is how the paper's stand. On the "
+            "reference: the queries that stand there, which is the paper's question. The rule: "
+            "relevant iff it stands on subject or reference.",
+            *_balance_said(scored),
+            *_models_said(able),
+            *evidence.warnings(able),
+        ),
     )
 
 
-def _judged(part: Predictions, score: np.ndarray, beta: float) -> dict[str, Any]:
+def _judged(part: Predictions) -> dict[str, Any]:
+    """A network's shares, and those without its offset."""
+    trained = Accuracy.of(part.raw_score, part.relevant)
+    return _shares(part, part.score) | share_cells(TRIPLE, trained, "trained_")
+
+
+def _shares(part: Predictions, score: np.ndarray) -> dict[str, Any]:
     there = part.stands == "on the reference"
-    found = Accuracy.of(score, part.relevant, beta=beta, task=part.task)
-    asked = Accuracy.of(score[there], part.relevant[there], beta=beta)
-    row = share_cells(SHARES, found) | share_cells(SHARES, asked, "reference_")
+    found = Accuracy.of(score, part.relevant, task=part.task)
+    asked = Accuracy.of(score[there], part.relevant[there])
+    row = share_cells(TRIPLE, found) | share_cells(TRIPLE, asked, "reference_")
     return row | {"queries": found.n_rows, "goals": found.n_tasks, "base_rate": found.base_rate}
 
 
-def _as_trained(part: Predictions) -> dict[str, Any]:
-    return share_cells(SHARES, Accuracy.of(part.raw_score, part.relevant), "trained_")
-
-
-def _bodies_notes(scored: Predictions | None, models: Sequence[Model]) -> list[str]:
-    said = [
-        "Ours: queries of test scenes of family on, at beta = 0 with the offset that validation "
-        "chose; as trained: without it, which is how the paper's stand. On the reference: the "
-        "queries that stand there, the paper's question. The rule: relevant iff it stands on "
-        "subject or reference."
+def _balance_said(scored: Predictions | None) -> list[str]:
+    if scored is None:
+        return []
+    return [
+        f"Ours: {percent(float(np.mean(scored.relevant)))} of {number(len(scored))} queries are "
+        f"relevant, {percent(paper().test['on'].share)} of the paper's."
     ]
-    if scored is not None:
-        share = float(np.mean(scored.relevant))
-        said.append(
-            f"Ours: {percent(share)} of {number(len(scored))} queries are relevant, "
-            f"{percent(paper().test['on'].share)} of the paper's."
-        )
-    return said + _models_said(models)
