@@ -35,31 +35,21 @@ from relevance.report.reproduction.tables import (
 )
 from relevance.store import Dataset
 
-__all__ = [
-    "Model",
-    "build",
-    "models_of",
-    "reproduce",
-    "rerun_config",
-    "to_rerun",
-    "to_score",
-]
+__all__ = ["Model", "build", "models_of", "prepare", "rerun_config", "to_rerun", "to_score"]
 
 Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
+"""What gives the progress of a part, named in words."""
 
 
-def reproduce(
+def prepare(
     root: str | Path,
-    out: str | Path | None = None,
-    *,
-    checkpoints: Sequence[str | Path] = (),
+    checkpoints: Sequence[str | Path],
     config: EvaluationConfig,
     bar: Bar,
-) -> Path:
-    """Make the predictions and reruns that are missing, then `build`; the path of the page.
+) -> None:
+    """Make the predictions and reruns that `build` would miss.
 
-    The reruns of a checkpoint that were made with other settings are made anew with these.
-    `bar` gives the progress of each part, named in words.
+    Reruns of a checkpoint that were made with other settings are made anew with these.
     """
     dataset = Dataset.open(root)
     models = models_of(dataset, checkpoints)
@@ -70,7 +60,6 @@ def reproduce(
         with bar(f"{model.name}: tasks") as progress:
             settings = rerun_config(dataset, model, config)
             evaluate(root, _file(model), settings, progress=progress)
-    return build(root, out, checkpoints=checkpoints)
 
 
 def to_score(dataset: Dataset, models: Sequence[Model]) -> list[Model]:

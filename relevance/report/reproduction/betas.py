@@ -115,8 +115,8 @@ def sheet(found: Curves) -> Sheet:
         shares("the paper's", "paper_false_irrelevant", decimals=0),
         saved("saved, the look not paid", "saved_free"),
         shares("the paper's", "paper_saved"),
-        saved("saved, the look paid", "saved"),
-        saved("saved, misses counted", "saved_counted"),
+        saved("saved, the look paid", "saved", ends=False),
+        saved("saved, misses counted", "saved_counted", ends=False),
         counts("missed", "missed"),
     )
     return Sheet(
@@ -232,12 +232,11 @@ def _saved(*axes: Axes, found: Curves) -> None:
                 markersize=4.5,
                 label="false irrelevant, the paper's",
             )
-            low, high = paper().axes["saved"]
-            ax.set_ylim(low, high)
-            _say_outside(ax, {"the look paid": paid, "the look not paid": values})
+            ax.set_ylim(*paper().axes["saved"])
         else:
             shown = [*values, *lost, *paper().axes["saved"]]
             ax.set_ylim(min(shown) - 0.03, max(shown) + 0.03)
+        _say_outside(ax, {"the look paid": paid, "the look not paid": values})
     axes[0].figure.legend(
         loc="outside lower center",
         ncols=3,

@@ -13,6 +13,7 @@ import numpy as np
 
 from relevance.evaluation import (
     EvaluationConfig,
+    EvaluationError,
     Predictions,
     in_group,
     left_out,
@@ -31,6 +32,7 @@ from relevance.store import Dataset
 
 WAY = SEARCH, GUIDE = "tree", "prune"
 """The paper's: leave out what the network calls irrelevant, in an uninformed search."""
+SPLIT = "test"
 TRANSFORMER = "vit"
 POINTS = 0.1
 """By how much the true relevant share moves over the paper's range of beta, and over ours."""
@@ -148,6 +150,7 @@ class Evidence:
         self.dataset = dataset
         self.models = models_of(dataset, given)
         self._predictions: dict[str, Predictions] = {}
+        self._warnings: dict[str, list[str]] = {}
         self._reruns: dict[str, dict[tuple[str, str, float], list[dict[str, Any]]]] = {}
 
     def queries(self, model: Model, group: str = "all") -> Predictions:
@@ -172,15 +175,14 @@ class Evidence:
 
     def warnings(self, models: Iterable[Model]) -> list[str]:
         """What a reader should know of the predictions and reruns of some."""
-        return [
-            f"{model.name}: {line}."
-            for model in models
-            for line in (
-                *unjudged(self.dataset, model.name),
-                *left_out(self.dataset, model.name),
-                *([model.trouble] if model.trouble else []),
-            )
-        ]
+        return [line for model in models for line in self._known(model)]
+
+    def _known(self, model: Model) -> list[str]:
+        if model.name not in self._warnings:
+            lines = [*unjudged(self.dataset, model.name), *left_out(self.dataset, model.name)]
+            lines += [model.trouble] if model.trouble else []
+            self._warnings[model.name] = [f"{model.name}: {line}." for line in lines]
+        return self._warnings[model.name]
 
 
 # --- what is asked of them ---------------------------------------------------------------------
@@ -188,7 +190,7 @@ class Evidence:
 
 def is_scored(dataset: Dataset, model: Model) -> bool:
     """Whether its predictions on the test split are there, and those of the present labels."""
-    files = dataset.files("predictions", name=model.name, split="test")
+    files = dataset.files("predictions", checkpoint_id=model.name, split="test")
     return bool(files) and not unjudged(dataset, model.name)
 
 
@@ -212,7 +214,12 @@ def our_betas(predictions: Predictions) -> tuple[float, ...]:
 
 def rerun_config(dataset: Dataset, model: Model, start: EvaluationConfig) -> EvaluationConfig:
     """The settings of the reruns that the tables and figures need of a scored model, and of all
-    that `start` asks for besides."""
+    that `start` asks for besides.
+
+    EvaluationError for another split than the test split.
+    """
+    if start.split != SPLIT:
+        raise EvaluationError(f"split {start.split}: expected {SPLIT}, which the tables are of")
     betas = {*start.betas}
     if "on" in model.heads:
         scored = read_predictions(dataset, model.name).queries().of("on")

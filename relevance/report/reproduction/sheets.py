@@ -111,13 +111,18 @@ def counts(title: str, name: str) -> Column:
 
 
 def times(title: str, name: str) -> Column:
-    """Seconds, with their interval below."""
-    return Column(title=title, cell=lambda row: _with_ends(row, name, _hundredths))
+    """Seconds, with their 67% interval below."""
+    return Column(title=title, cell=lambda row: _with_ends(row, name, _hundredths, _NARROW))
 
 
-def saved(title: str, name: str) -> Column:
-    """A share of time, with both of its intervals below."""
-    return Column(title=title, cell=lambda row: _with_ends(row, name, _rounded))
+def saved(title: str, name: str, *, ends: bool = True) -> Column:
+    """A share of time, with both of its intervals below unless they are for the files alone."""
+    below = {**_NARROW, **_WIDE} if ends else {}
+    return Column(title=title, cell=lambda row: _with_ends(row, name, _rounded, below))
+
+
+_NARROW, _WIDE = {"": ""}, {"_95": "95%: "}
+"""What the names of an interval's ends have behind them, and what is written before it."""
 
 
 def _hundredths(value: float | None) -> str:
@@ -128,21 +133,17 @@ def _rounded(value: float | None) -> str:
     return percent(value, 1).replace("-", "\N{MINUS SIGN}")
 
 
-def _with_ends(row: Row, name: str, shown: Callable[[float | None], str]) -> str:
-    value = row.get(name)
-    text = shown(value)
+def _with_ends(
+    row: Row, name: str, shown: Callable[[float | None], str], below: Mapping[str, str]
+) -> Markup:
+    text = Markup("{}").format(shown(row.get(name)))
     if text == DASH:
-        return DASH
-    ends = [
-        f"{before}{shown(low)} to {shown(high)}"
-        for suffix, before in (("", ""), ("_95", "95%: "))
-        if (low := row.get(f"{name}_low{suffix}")) is not None
-        and (high := row.get(f"{name}_high{suffix}")) is not None
-        and math.isfinite(low)
-    ]
-    return Markup("{}").format(text) + Markup("").join(
-        Markup("<small>{}</small>").format(end) for end in ends
-    )
+        return text
+    for suffix, before in below.items():
+        low, high = row.get(f"{name}_low{suffix}"), row.get(f"{name}_high{suffix}")
+        if low is not None and high is not None:
+            text += Markup("<small>{}{} to {}</small>").format(before, shown(low), shown(high))
+    return text
 
 
 def spread(name: str, narrow: Any, wide: Any) -> dict[str, float]:
