@@ -142,8 +142,17 @@ def _with_ends(
     for suffix, before in below.items():
         low, high = row.get(f"{name}_low{suffix}"), row.get(f"{name}_high{suffix}")
         if low is not None and high is not None:
-            text += Markup("<small>{}{} to {}</small>").format(before, shown(low), shown(high))
+            ends = _without_repeated_unit(shown(low), shown(high))
+            text += Markup("<small>{}{}</small>").format(before, ends)
     return text
+
+
+def _without_repeated_unit(low: str, high: str) -> str:
+    for unit in ("%", " ms", " s"):
+        if low.endswith(unit) and high.endswith(unit):
+            low = low.removesuffix(unit)
+            break
+    return f"{low} to {high}"
 
 
 def spread(name: str, narrow: Any, wide: Any) -> dict[str, float]:

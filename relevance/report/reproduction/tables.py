@@ -232,10 +232,10 @@ def planning_times(evidence: Evidence) -> Sheet:
             times("guided, mean", "guided"),
             times("of it the look", "look"),
             saved("saved", "saved"),
-            saved("saved, the look not paid", "saved_free"),
-            counts("tasks that both solve", "both"),
+            saved("the look not paid", "saved_free"),
+            counts("both solve", "both"),
             counts("missed", "missed"),
-            saved("saved, misses counted", "saved_counted"),
+            saved("misses counted", "saved_counted"),
         ),
         rows=tuple(rows),
         notes=(
