@@ -31,7 +31,7 @@ from relevance.report.reproduction.models import (
     transformer,
 )
 from relevance.report.reproduction.sheets import MISSING, OURS, PAPER, RULE
-from relevance.report.reproduction.tables import time_saved
+from relevance.report.reproduction.tables import planning_times, time_saved
 from relevance.store import Dataset
 
 FEW = replace(EVALUATION, tasks=2, sweep_tasks=2, betas=(), guides=("prune",), priors=())
@@ -237,12 +237,11 @@ def test_weights_that_cannot_be_read_leave_the_rest(tmp_path) -> None:
     model.file.write_bytes(b"broken")
     evidence = Evidence(Dataset.open(tmp_path / "copy"))
     assert any("copy" in line for line in evidence.warnings(evidence.models))
-    path = reproduction.build(tmp_path / "copy")
-    assert any(row["whose"] == OURS for row in rows_of(path, "table-2-time"))
+    assert any(row["whose"] == OURS for row in planning_times(evidence).rows)
 
 
 def test_the_command_prints_the_page(tmp_path, capsys) -> None:
-    root, _ = reproduced()
+    root = labelled()
     assert main(["reproduce", str(root), "--no-rerun", "--out", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out.strip()
     assert printed == str(tmp_path / "out" / "index.html")

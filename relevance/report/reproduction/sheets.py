@@ -84,11 +84,11 @@ def words(title: str, name: str) -> Column:
     return Column(title=title, cell=lambda row: str(row.get(name) or ""), left=True)
 
 
-def shares(title: str, name: str, *, decimals: int = 1) -> Column:
-    """A share in 0..1, by the row's own `decimals` where it has some: the paper's have none."""
+def shares(title: str, name: str, *, decimals: int = 1, theirs: int = 0) -> Column:
+    """A share in 0..1; those of the paper's rows have as few decimals as it gives."""
 
     def cell(row: Row) -> str:
-        return percent(row.get(name), row.get("decimals", decimals))
+        return percent(row.get(name), theirs if row["whose"] == PAPER else decimals)
 
     return Column(title=title, cell=cell)
 

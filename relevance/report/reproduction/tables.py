@@ -93,7 +93,7 @@ def label_distribution(dataset: Dataset) -> Sheet:
             counts(f"scenes, {split}", f"{split}_scenes"),
             counts("relevant queries", f"{split}_relevant"),
             counts("irrelevant", f"{split}_irrelevant"),
-            shares("relevant share", f"{split}_share"),
+            shares("relevant share", f"{split}_share", theirs=1),
         ]
     return Sheet(
         name="table-1",
@@ -170,7 +170,7 @@ def accuracies(evidence: Evidence) -> Sheet:
         row: dict[str, Any] = {"group": group, "by": whose}
         if whose == PAPER:
             base = 1 - paper().test[group].share
-            row |= {"whose": PAPER, "decimals": 0, "base_rate": base}
+            row |= {"whose": PAPER, "base_rate": base}
             row |= share_cells(TRIPLE, paper().accuracy[group])
         elif model is None:
             row |= _none()
@@ -365,7 +365,7 @@ def _models_said(models: Sequence[Model]) -> list[str]:
 def bodies(evidence: Evidence) -> Sheet:
     """Table III: every body on `on`."""
     rows: list[dict[str, Any]] = [
-        {"body": name, "by": "paper", "whose": PAPER, "decimals": 0, **share_cells(TRIPLE, of)}
+        {"body": name, "by": "paper", "whose": PAPER, **share_cells(TRIPLE, of)}
         for name, of in paper().bodies.items()
     ]
     able = [model for model in evidence.models if "on" in model.heads]
