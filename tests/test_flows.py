@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -421,3 +422,22 @@ def test_a_flow_ends_with_its_server(home: Path) -> None:
         _, errors = process.communicate(timeout=120)  # Prefect alone takes four minutes
         assert process.returncode == 1
         assert "the flow's Prefect server died; start the flow again" in errors
+
+
+@pytest.mark.slow  # trains, and reruns the planner in a process of its own
+def test_reproduce_makes_what_is_missing(prefect_server: None, tmp_path: Path) -> None:
+    from evaluated import evaluated
+
+    from flows.reproduce import reproduce
+    from relevance.report.paper import paper
+    from relevance.store import Dataset
+
+    data = tmp_path / "data"
+    shutil.copytree(evaluated()[0], data)
+    shutil.rmtree(data / "predictions")
+    few = {"tasks": 1, "sweep_tasks": 1, "betas": [], "guides": ["prune"], "priors": []}
+    page = Path(reproduce(dataset=str(data), preset="smoke", overrides=few, max_workers=1))
+    assert page == data / "paper" / "index.html"
+    assert {file.suffix for file in page.parent.rglob("figure-8-*")} == {".png", ".svg"}
+    rows = Dataset.open(data).read_rows("evaluations")
+    assert {row["beta"] for row in rows} >= {*paper().curves["beta"]}

@@ -62,7 +62,8 @@ def test_flows_refuse_bad_parameters_before_any_work(tmp_path: Path) -> None:
 
 
 def test_short_names_are_only_ours() -> None:
-    assert set(deployments()) >= {"generate", "label", "train", "evaluate", "retrain"}
+    known = {"generate", "label", "train", "evaluate", "reproduce", "retrain"}
+    assert set(deployments()) >= known
     assert [full_name(name) for name in deployments()] == [f"{n}/{n}" for n in deployments()]
     assert full_name("generate/other") == "generate/other"
     assert full_name("somebody") == "somebody"

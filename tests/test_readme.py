@@ -40,7 +40,8 @@ NOT_RUN = {
 }
 """Lines of shell that are left out, and why."""
 SLOW = (
-    r"^relevance (append|merge|repair|label|generate|export|train|evaluate|check|suite|coverage)\b"
+    r"^relevance (append|merge|repair|label|generate|export|train|evaluate|reproduce|check|suite|"
+    r"coverage)\b"
 )
 """Lines that take their time; only the slow test runs them."""
 DRAWING = r"[│├└→]|->|^[A-Z]+/\s*$|\.parquet|\.tar"

@@ -85,7 +85,8 @@ def read_predictions(dataset: Dataset, checkpoint_id: str, *, split: str = "test
     is left out, see `unjudged`.
     """
     policy = policy_of_checkpoint(dataset, checkpoint_id)
-    with dataset.connect(policy=policy) as connection:
+    names = ("judged", "predictions", "labels", "scenes", "objects", "carried")
+    with dataset.connect(policy=policy, names=names) as connection:
         columns = connection.execute(
             """
             select predicate, family, relevant, score, raw_score, is_goal_object, stands,

@@ -141,7 +141,7 @@ def left_out(dataset: Dataset, checkpoint_id: str) -> list[str]:
 
 
 def _all_rows(dataset: Dataset, checkpoint_id: str) -> list[dict[str, Any]]:
-    with dataset.connect() as connection:
+    with dataset.connect(names=("evaluations", "scenes")) as connection:
         found = connection.execute(
             """
             select e.*, family from evaluations e

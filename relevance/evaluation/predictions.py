@@ -109,7 +109,7 @@ def unjudged(dataset: Dataset, checkpoint_id: str, *, split: str = "test") -> li
     predicates of which it says nothing are none of its own.
     """
     policy = policy_of_checkpoint(dataset, checkpoint_id)
-    with dataset.connect(policy=policy) as connection:
+    with dataset.connect(policy=policy, names=("predictions", "labels")) as connection:
         ((scores, labels, both, changed),) = connection.execute(
             """
             with p as (from predictions where checkpoint_id = $1 and split = $2),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from relevance.hashing import content_hash
 from relevance.report.style import INK, KEPT, LOST, RELEVANT
-from relevance.scene import PREDICATES
+from relevance.scene import PREDICATES, Scene, project, vertices
 from relevance.store import Dataset, Sample
 
 Rows = Callable[..., list[dict[str, Any]]]
@@ -118,22 +118,23 @@ def choose_examples(
 
 def draw_examples(dataset: Dataset, chosen: Sequence[dict[str, Any]]) -> list[Example]:
     """Read the scenes of the chosen tasks and outline what matters in each."""
-    shards = sorted({row["shard"] for row in chosen})
-    wanted = {row["scene_id"] for row in chosen}
-    samples = {
+    samples = test_samples(dataset, chosen)
+    return [_example(samples[row["scene_id"]], row) for row in chosen]
+
+
+def test_samples(dataset: Dataset, rows: Sequence[Mapping[str, Any]]) -> dict[str, Sample]:
+    """The pictures of the scenes of test tasks, by the scene's id."""
+    shards = sorted({row["shard"] for row in rows})
+    wanted = {row["scene_id"] for row in rows}
+    return {
         sample.key: sample
         for sample in (dataset.samples("test", shards) if shards else ())
         if sample.key in wanted
     }
-    return [_example(samples[row["scene_id"]], row) for row in chosen]
 
 
 def _example(sample: Sample, row: dict[str, Any]) -> Example:
     scores, relevant = row["scores"], set(row["relevant"])
-    words = [
-        f"{action[0]} {action[1]}" + (f" on {action[2]}" if len(action) > 2 else "")
-        for action in row["actions"]
-    ]
     return Example(
         anchor=row["anchor"],
         goal=f"{row['predicate']}({row['subject']}, {row['reference']})",
@@ -145,13 +146,21 @@ def _example(sample: Sample, row: dict[str, Any]) -> Example:
             reference=row["reference"],
             scores=scores,
         ),
-        plan=" → ".join(words),
+        plan=in_words(row["actions"]),
         status=row["status"],
         scores=[
             (box.name, _hex(box.color), box.name in relevant, scores.get(box.name))
             for box in sample.scene.objects
         ],
         note=row["note"],
+    )
+
+
+def in_words(actions: Iterable[Sequence[str]]) -> str:
+    """A plan's actions, one after the other."""
+    return " → ".join(
+        f"{action[0]} {action[1]}" + (f" on {action[2]}" if len(action) > 2 else "")
+        for action in actions
     )
 
 
@@ -163,10 +172,12 @@ def outlined(
     reference: str,
     scores: Mapping[str, float] | None = None,
     beta: float = 0.0,
+    final: Sequence[Mapping[str, Any]] = (),
 ) -> str:
     """A scene as SVG: relevant objects outlined, goal objects tagged S and R.
 
-    With scores, queries that the network judges wrongly get a dashed outline.
+    With scores, queries that the network judges wrongly get a dashed outline. `final` (of `plans`)
+    says where each moved object ends: an arrow goes there, numbered in the order of the moves.
     """
     height, width = sample.mask.shape
     done, png = cv2.imencode(".png", cv2.cvtColor(sample.image, cv2.COLOR_RGB2BGR))
@@ -206,7 +217,40 @@ def outlined(
                 f'font-weight="700" font-family="system-ui, sans-serif" fill="{INK}">{letter}'
                 f"<title>{escape(box.name)}</title></text>"
             )
-    return "".join([*parts, *tags, "</svg>"])
+    moves = [_move(sample.scene, place, number) for number, place in enumerate(final, 1)]
+    return "".join([*parts, *moves, *tags, "</svg>"])
+
+
+def _move(scene: Scene, place: Mapping[str, Any], number: int) -> str:
+    """An arrow from where a box stands to where it ends, whose top face is drawn there."""
+    box = scene[place["name"]]
+    there = replace(box, position=tuple(place["position"]), yaw=place["yaw"])
+    tops = np.array([[*b.position[:2], b.top] for b in (box, there)])
+    (start, end), _ = project(scene.camera, tops)
+    face, _ = project(scene.camera, vertices(there)[4:])
+    way = end - start
+    length = max(float(np.hypot(*way)), 1e-6)
+    ahead, beside = way / length, np.array([-way[1], way[0]]) / length
+    # the number stands at the end, and the arrow's head just before it
+    tip = end - ahead * min(6.0, length / 2)
+    head = [tip, *(tip - 7 * ahead + side * beside for side in (3.2, -3.2))]
+    color = _hex(box.color)
+    x, y = end
+    return (
+        f"<g><title>{number}: {escape(box.name)}</title>"
+        f'<polygon points="{_points(face)}" fill="{color}" fill-opacity="0.35" stroke="{INK}" '
+        'stroke-dasharray="3 2"/>'
+        f'<path d="M{_points([start, tip])}" stroke="#fff" stroke-width="3.6" fill="none"/>'
+        f'<path d="M{_points([start, tip])}" stroke="{INK}" stroke-width="1.6" fill="none"/>'
+        f'<polygon points="{_points(head)}" fill="{INK}" stroke="#fff" stroke-width="0.8"/>'
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5.5" fill="{INK}"/>'
+        f'<text x="{x:.1f}" y="{y + 2.9:.1f}" text-anchor="middle" font-size="8" '
+        f'font-weight="700" font-family="system-ui, sans-serif" fill="#fff">{number}</text></g>'
+    )
+
+
+def _points(points: Iterable[Sequence[float] | np.ndarray]) -> str:
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
 
 
 def _path(mask: np.ndarray) -> str:

@@ -7,26 +7,23 @@ Every figure names the number of tasks that it rests on.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import jinja2
-from markupsafe import Markup
-
 from relevance.evaluation import NETWORK, RULE, policy_of_checkpoint
-from relevance.metrics import Interval
 from relevance.networks import read_record
 from relevance.report import style
 from relevance.report.data import data_section, planner_section
 from relevance.report.gallery import Rows, choose_examples, draw_examples
 from relevance.report.guided import guided_section
+from relevance.report.misses import misses_section
 from relevance.report.network import network_section
+from relevance.report.pages import write_page
 from relevance.report.paper import paper
 from relevance.report.style import DASH, GROUPS, TIMES, number, percent, seconds
-from relevance.store import Dataset, DatasetError, replacing
+from relevance.store import Dataset, DatasetError
 
 
 def build(
@@ -44,42 +41,7 @@ def build(
     """
     dataset = Dataset.open(root)
     out = Path(out) if out is not None else dataset.path / "report.html"
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    environment.filters |= {
-        "percent": percent,
-        "seconds": seconds,
-        "times": times,
-        "spread": spread,
-        "number": number,
-    }
-    page = environment.get_template("page.html.j2").render(_page(dataset, checkpoint_id, examples))
-    with replacing(out) as temporary:
-        temporary.write_text(page)
-    return out
-
-
-def times(interval: Interval) -> Markup:
-    """A ratio with its interval."""
-    if not math.isfinite(interval.value):
-        return Markup(DASH)
-    low, high = f"{interval.low:.2f}", f"{interval.high:.2f}"
-    return Markup("{}{} <small>{} to {}</small>").format(f"{interval.value:.2f}", TIMES, low, high)
-
-
-def spread(interval: Interval) -> Markup:
-    """A time with its interval."""
-    if not math.isfinite(interval.value):
-        return Markup(DASH)
-    value, low, high = map(seconds, (interval.value, interval.low, interval.high))
-    if low.split()[-1:] == high.split()[-1:]:
-        low = low.split()[0]
-    return Markup("{} <small>{} to {}</small>").format(value, low, high)
+    return write_page("page.html.j2", out, **_page(dataset, checkpoint_id, examples))
 
 
 _CHECKPOINTS = """
@@ -109,6 +71,7 @@ def _page(dataset: Dataset, checkpoint_id: str | None, examples: int) -> dict[st
         "planner": planner,
         "model": model,
         "guided": guided,
+        "misses": misses_section(dataset, rows, chosen, policy),
         "examples": pictures,
         "headlines": _headlines(data, planner, model, guided),
         "policy": policy,

@@ -62,8 +62,14 @@ class Paper:
     """By family: weight of the relevant objects in the loss."""
     bodies: Mapping[str, Shares]
     """Table III: accuracy on `on` by body."""
+    body_names: Mapping[str, str]
+    """Our name of each body of `bodies`."""
     curves: Mapping[str, tuple[float, ...]]
     """Figures 7 and 8: shares and time saved over `beta`, on `on`."""
+    axes: Mapping[str, tuple[float, float]]
+    """Of those figures: ends of `beta`, `share` and `saved`."""
+    notes: Mapping[str, tuple[str, ...]]
+    """What to know of `data`, `accuracy`, `times`, `bodies` and `beta`, and how we read it."""
 
     @property
     def seconds(self) -> tuple[float, float]:
@@ -98,6 +104,9 @@ def paper() -> Paper:
         test=queries["test"],
         eta={f["name"]: f["eta"] for f in families},
         bodies={b["name"]: Shares(*b["accuracy"]) for b in raw["bodies"]},
+        body_names={b["name"]: b["body"] for b in raw["bodies"]},
+        axes={name: (float(low), float(high)) for name, (low, high) in raw["axes"].items()},
+        notes={name: tuple(said) for name, said in raw["notes"].items()},
         curves={name: tuple(map(float, values)) for name, values in raw["curves"].items()},
     )
 

@@ -1,4 +1,4 @@
-"""The report's plots as inline SVG, all in one quiet style.
+"""The report's plots, inline or as files, all in one quiet style.
 
 Text stays text and takes the page's font; ids start with the plot's name, so that many plots
 can share a page. Colours are those of `style`.
@@ -11,12 +11,13 @@ import re
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
@@ -41,12 +42,57 @@ from relevance.report.style import (
     seconds,
 )
 from relevance.report.style import groups as shown_groups
+from relevance.store import replacing
 
 if TYPE_CHECKING:  # the planner comes with it, of which most plots know nothing
     from relevance.evaluation import Comparison, Covered, Predictions
 
+DPI = 200
+"""Of pictures as files."""
 QUANTILES = np.linspace(0, 1, 201)
 """Shares at which distributions of times are drawn; the middle one is the median."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drawing:
+    """A plot before it is drawn: into the page, or into files."""
+
+    name: str
+    """What its ids start with, and its files are called."""
+    draw: Callable[..., None]
+    """Draws into the axes; `given` follows them."""
+    given: Mapping[str, Any]
+    size: tuple[float, float] = (4.8, 2.9)
+    """Inches."""
+    widths: tuple[float, ...] = (1.0,)
+    """Of the panels side by side, relative to each other."""
+
+    def inline(self) -> str:
+        """Inline SVG: text takes the page's font, ids are told from those of other plots."""
+        text = self._saved("svg", transparent=True).decode()
+        text = text[text.index("<svg") :]
+        text = re.sub(r'\bid="', f'id="{self.name}-', text)
+        text = re.sub(r'((?:xlink:)?href="#|url\(#)', rf"\g<1>{self.name}-", text)
+        text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+        text = text.replace("'DejaVu Sans'", "var(--font)")
+        return re.sub(r'<svg[^>]*?(viewBox="[^"]*")[^>]*>', r'<svg \1 role="img">', text, count=1)
+
+    def write(self, folder: Path) -> None:
+        """NAME.svg and NAME.png, on white."""
+        for kind in ("svg", "png"):
+            with replacing(folder / f"{self.name}.{kind}") as temporary:
+                temporary.write_bytes(self._saved(kind))
+
+    def _saved(self, kind: str, **options: Any) -> bytes:
+        made = {"svg": {"Date": None}, "png": {"Software": None}}[kind]  # equal rows, equal bytes
+        with mpl.rc_context({**STYLE, "svg.hashsalt": self.name}):
+            figure = Figure(figsize=self.size, layout="constrained")
+            panels = len(self.widths)
+            axes = figure.subplots(1, panels, squeeze=False, width_ratios=self.widths)[0]
+            self.draw(*axes, **self.given)
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format=kind, dpi=DPI, metadata=made, **options)
+        return buffer.getvalue()
 
 
 def svg(
@@ -57,23 +103,8 @@ def svg(
     panels: int = 1,
     **given: Any,
 ) -> str:
-    """Draw into `panels` axes side by side; inline SVG whose ids start with `name`.
-
-    `size` in inches; `given` goes to `draw` after the axes.
-    """
-    with mpl.rc_context({**STYLE, "svg.hashsalt": name}):
-        figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasSVG(figure)
-        draw(*figure.subplots(1, panels, squeeze=False)[0], **given)
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r'\bid="', f'id="{name}-', text)
-    text = re.sub(r'((?:xlink:)?href="#|url\(#)', rf"\g<1>{name}-", text)
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = text.replace("'DejaVu Sans'", "var(--font)")
-    return re.sub(r'<svg[^>]*?(viewBox="[^"]*")[^>]*>', r'<svg \1 role="img">', text, count=1)
+    """Draw into `panels` axes side by side; inline SVG whose ids start with `name`."""
+    return Drawing(name=name, draw=draw, given=given, size=size, widths=(1.0,) * panels).inline()
 
 
 def _percent_axis(axis: Any) -> None:
