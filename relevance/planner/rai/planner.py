@@ -24,8 +24,9 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+import time
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -167,9 +168,10 @@ def plan_rai(
 
     A guide restricts what rai may move (those that order the search have no effect on it); its
     last round has the whole seconds. `seconds.total` is the CPU time of the subprocess without
-    loading Python and rai; counts are rai's waypoint problems (keyframe), motif samples (pose),
-    motions (path) and action sequences (nodes). `check_ok` stays False: rai's plans are for the
-    replay to judge.
+    loading Python and rai, and that of the look; counts are rai's waypoint problems (keyframe) and
+    how many action sequences they are of (sequences), motif samples (pose), problems of motions
+    (path) and sequences whose waypoints were found (nodes). `check_ok` stays False: rai's plans are
+    for the replay to judge.
     Raises PeerError where rai is missing, SceneError for an unknown predicate or object.
     """
     require_rai()
@@ -189,11 +191,22 @@ def _plan(
         return PlanResult(
             goal=goal, status="solved", final={}, cost=0.0, counts=Counts(), seconds=Seconds()
         )
+    began = time.process_time()
     scores = ask(guide, scene, goal)
-    *early, last = rounds(everything, goal, guide, scores)
+    look = time.process_time() - began
+    result = _rounds(scene, goal, config, rounds(everything, goal, guide, scores))
+    seconds = replace(result.seconds, guide=look, total=result.seconds.total + look)
+    return replace(result, seconds=seconds, looked=bool(scores))
+
+
+def _rounds(
+    scene: Scene, goal: Goal, config: RaiConfig, allowed: Sequence[frozenset[str]]
+) -> PlanResult:
+    """An attempt for each of the sets that may move, until one succeeds."""
+    *early, last = allowed
     spent, end = _Spent(), config.seconds
-    for allowed in early:  # these share the seconds, the last round has them whole
-        result = _attempt(scene, goal, allowed, config, spent, end)
+    for some in early:  # these share the seconds, the last round has them whole
+        result = _attempt(scene, goal, some, config, spent, end)
         if result.status == "solved":
             return result
         if spent.seconds.total >= end:
@@ -235,6 +248,8 @@ class _Spent:
 
     counts: Counts = field(default_factory=Counts)
     seconds: Seconds = field(default_factory=Seconds)
+    sequences: set[str] = field(default_factory=set)
+    """Those whose switches were sought."""
 
 
 def _attempt(
@@ -302,7 +317,7 @@ def _run(
         ended, last = "", ""
         try:
             for line in process.stdout:
-                _count(line, spent.counts)
+                _count(line, spent)
                 ended = next((w for w in (EXHAUSTED, NO_SEQUENCE) if w in line), "")
                 if ended:
                     process.kill()
@@ -338,11 +353,14 @@ def _children() -> float:
     return usage.ru_utime + usage.ru_stime
 
 
-def _count(line: str, counts: Counts) -> None:
+def _count(line: str, spent: _Spent) -> None:
+    counts = spent.counts
     if line.startswith("+++ solving motif"):
         counts.pose += 1
     elif line.startswith("+++ solving sub-plan"):
         counts.keyframe += 1
+        spent.sequences.add(line)
+        counts.sequences = len(spent.sequences)
     elif line.startswith("MOTION"):
         counts.path += 1
     elif line.startswith("SEQUENCE"):
@@ -414,18 +432,25 @@ def rai_problem(
     """
     ids = {box.name: f"box{i}" for i, box in enumerate(scene.objects)}
     on = goal.predicate.stacked
+    # Nothing keeps a subject apart from what carries it: where that stands on the reference, the
+    # reference has to be cleared.
+    carriers = scene[goal.subject].supports
+    beneath = on and any(goal.reference in scene[name].supports for name in carriers)
     parts, lines = _hand()
-    lines = [*_world(scene, "is_table, clear" if on else "is_table, clear, is_base"), *lines]
+    lines = [*_world(scene, "is_table, clear" if beneath else "is_table, clear, is_base"), *lines]
     turn = {box.name: math.pi / 2 if box.size[0] < box.size[1] else 0.0 for box in scene.objects}
     places = {"target": goal.reference if on else "table", "table": "table"}
     carrying = {name for box in scene.objects for name in box.supports}
+    moves: set[str] = set()
     for box in scene.objects:
         facts = [] if box.name in carrying else ["clear"]
         stays = box.name not in movable or (box.name == goal.reference and not on)
         if not stays and min(box.size[:2]) <= 2 * panda().max_opening:
             facts += ["is_object", "is_subject" if box.name == goal.subject else "is_blocker"]
-        if on and box.name == goal.reference:
+        if beneath and box.name == goal.reference:
             facts.append("is_base")
+        if "is_object" in facts:
+            moves.add(box.name)
         lines += _box(box, scene, ids, turn, facts)
     there = there or _region(scene, goal).rectangles[0]
     lines.append(_target(scene, goal, there, ids[goal.reference], turn))
@@ -433,8 +458,11 @@ def rai_problem(
     pairs["hand"] = [[part, rai_name] for rai_name in ids.values() for part in parts]
     pairs["fixed"] = [[part, "slab"] for part in parts]
     for i, a in enumerate(scene.objects):
-        pairs["boxes"].append([ids[a.name], "foot", ids[a.name], ids[a.name]])
+        if a.name in moves:
+            pairs["boxes"].append([ids[a.name], "foot", ids[a.name], ids[a.name]])
         for b in scene.objects[:i]:
+            if not moves & {a.name, b.name}:
+                continue
             if b.name in a.supports or a.name in b.supports:
                 continue
             # Boxes that stand closer than their grown shapes allow are kept apart as they are.
