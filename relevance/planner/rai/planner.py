@@ -9,7 +9,8 @@ action sequences.
 How the tasks differ from ours: rai takes a box across its narrower edge only, at any tilt; each
 box is moved once, blockers go to the table; for goals beside a reference that reference stays.
 Boxes are rounded (1 cm) against the hand, and 4 mm against each other with some room added to
-their footprints. Its plans are judged by `simulation.replay`, like ours.
+their footprints. Two boxes that both stay are no pair that rai looks at, so that a guide makes its
+problems smaller, too. Its plans are judged by `simulation.replay`, like ours.
 """
 
 from __future__ import annotations

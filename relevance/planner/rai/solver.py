@@ -1,12 +1,13 @@
 """Runs rai's own LGP solver on the problem in the current folder; a program of its own.
 
-`peer.py` starts it as a subprocess, since rai never returns when there is no plan. It imports
+`planner.py` starts it as a subprocess, since rai never returns when there is no plan. It imports
 nothing of this project. Reads `task.g`, `task.lgp`, `task.json`; writes `started.json` (CPU
 seconds of loading) and, when there is a plan, `found.json`.
 
 rai decides on the actions and solves the switches in one problem (its `LGP_Tool`); then each
 motion between two switches, and the last retreat, is a KOMO problem of its own. A plan with a
-motion that cannot be solved is given up and rai is asked for the next.
+motion that cannot be solved is given up and rai is asked for the next, before any motion where
+something overlaps at a switch.
 """
 
 from __future__ import annotations
