@@ -11,7 +11,9 @@ import pytest
 from relevance.cli import main
 from relevance.planner import Guide
 from relevance.planner.rai import planner as peer
-from relevance.planner.rai.planner import PeerError, RaiConfig, plan_rai, rai_problem
+from relevance.planner.rai import problem
+from relevance.planner.rai.planner import PeerError, RaiConfig, plan_rai
+from relevance.planner.rai.problem import rai_problem
 from relevance.scene import Box, Scene, SceneError, goal_holds, scene_to_json
 from relevance.simulation import replay
 
@@ -38,7 +40,7 @@ SCENE = Scene(
 @pytest.fixture
 def texts(monkeypatch, tmp_path):
     """A problem in rai's words, where rai need not be installed."""
-    monkeypatch.setattr(peer, "_models", lambda: tmp_path)
+    monkeypatch.setattr(problem, "_models", lambda: tmp_path)
     return lambda text, movable=SCENE.names: rai_problem(SCENE, SCENE.goal(text), movable=movable)
 
 
@@ -62,7 +64,7 @@ def test_facts_say_who_can_be_moved_and_where_to(texts):
 
 
 def test_what_carries_the_subject_has_to_be_gone_from_the_reference(monkeypatch, tmp_path):
-    monkeypatch.setattr(peer, "_models", lambda: tmp_path)
+    monkeypatch.setattr(problem, "_models", lambda: tmp_path)
     tower = Scene(
         objects=(
             box("blue", 0.0, 0.0, BLUE),
@@ -70,9 +72,9 @@ def test_what_carries_the_subject_has_to_be_gone_from_the_reference(monkeypatch,
             box("red", 0.0, 0.0, RED, size=(0.04, 0.04, 0.04), bottom=0.11, on="green"),
         )
     )
-    problem = rai_problem(tower, tower.goal("on(red, blue)"), movable=tower.names)
-    assert "is_base" in facts(problem, "box0")
-    assert "is_base" not in facts(problem, "table")
+    found = rai_problem(tower, tower.goal("on(red, blue)"), movable=tower.names)
+    assert "is_base" in facts(found, "box0")
+    assert "is_base" not in facts(found, "table")
 
 
 def test_boxes_turn_so_that_rai_takes_them_across_their_narrow_edge(texts):
