@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,14 +14,17 @@ from relevance.benchmarks import (
     Rerun,
     Settings,
     figures,
+    guides,
     measured_guides,
+    measured_peer,
     read_reruns,
     rerun_guides,
 )
 from relevance.benchmarks.guides import ROWS, Tasks
 from relevance.cli import main
 from relevance.errors import RelevanceError
-from relevance.planner import PlannerConfig
+from relevance.planner import PLANNERS, Counts, PlannerConfig, PlanResult, Seconds, ask
+from relevance.planner.guides import rounds
 
 SETTINGS = Settings(
     seed=5,
@@ -197,3 +201,84 @@ def test_the_command_writes_rows_tables_and_plots_and_goes_on(tmp_path, capsys):
         assert (tmp_path / f"guides-{name}.svg").stat().st_size > 1000
     assert main([*words[:-2], "--max-actions", "4", "--out", str(tmp_path)]) == 2
     assert main(["bench", "guides", "--sizes", "2"]) == 2
+
+
+class Slow:
+    """A planner of somebody else: moves the subject, and `mint` in tasks of 4 boxes; gives up on
+    every third task."""
+
+    name = "slow"
+    Config = PlannerConfig
+
+    def __init__(self):
+        self.asked = []
+
+    def require(self): ...
+
+    def warm_up(self): ...
+
+    def plan(self, scene, goal, *, config=None, guide=None, movable=None, replay=True):
+        scores = ask(guide, scene, goal)
+        [*_, allowed] = rounds(frozenset(scene.names), goal, guide, scores)
+        other = next(n for n in scene.names if n not in (goal.subject, goal.reference))
+        moved = (goal.subject, other) if len(scene.objects) == 4 else (goal.subject,)
+        hopeless = len({key for key, _ in self.asked} | {str((scene.id, goal))}) % 3 == 0
+        self.asked.append((str((scene.id, goal)), guide))
+        status = "solved" if set(moved) <= allowed and not hopeless else "limit"
+        seconds = Seconds(total=0.1 if guide else 1.0, guide=0.01 if guide else 0.0)
+        return PlanResult(
+            goal=goal, status=status, moved=moved, final={}, counts=Counts(sequences=len(allowed)),
+            seconds=seconds, looked=bool(scores),
+        )  # fmt: skip
+
+
+@pytest.fixture
+def slow(monkeypatch):
+    planner = PLANNERS.register(Slow.name, Slow())
+    monkeypatch.setattr(guides, "replay", lambda *a: SimpleNamespace(ok=True))
+    yield planner
+    PLANNERS.unregister(Slow.name)
+
+
+PEER = replace(SETTINGS, goals=1, priors=("none",), guides=("prune",), by="slow", peer=None)
+
+
+def test_another_planner_is_asked_further_where_it_solves_unguided(slow, tmp_path):
+    rows, _ = run(tmp_path, PEER)
+    unsolved = [row for row in rows if not row.solved_unguided]
+    assert [(row.prior, row.guide) for row in unsolved] == [("none", "none")] * 2
+    solved = [row for row in rows if row.solved_unguided]
+    assert len(solved) == 4 * 3
+    assert {row.prior for row in solved} == {"none", "true", "own plan"}
+    for row in solved:
+        assert (row.search, row.stop, row.seconds_unguided) == ("slow", "first", 1.0)
+        assert row.replays_unguided
+        knows = row.prior == "own plan" or row.size == 3  # there the subject is all that moves
+        assert row.prior == "true" or row.solved_guided == knows
+        assert row.replays_guided == (True if row.solved_guided else None)
+    # unguided first, then the guided ones, who takes turns at going first
+    assert [bool(guide) for _, guide in slow.asked].count(False) == 6
+    asked = len(slow.asked)
+    again, _ = run(tmp_path, PEER)
+    assert again == rows
+    assert len(slow.asked) == asked  # those without a plan are known, too
+
+
+def test_a_miss_of_another_planner_costs_its_unguided_run(slow, tmp_path):
+    rows, _ = run(tmp_path, PEER)
+    times, counts, plans, drawn = measured_peer(rows).tables
+    of = {line[:2]: line for line in times.rows}
+    assert of["all", "own plan"][5].startswith("0.10 (")
+    assert of["4", "none"][5].startswith("1.10 (")
+    assert of["3", "none"][6].startswith("10.00 (")
+    missed = {line[:2]: line[3] for line in plans.rows}
+    assert missed["3", "none"].startswith("0 of 2")
+    assert missed["4", "none"].startswith("2 of 2")
+    assert [line[1][:6] for line in drawn.rows] == ["2 of 3", "2 of 3"]
+    assert len(counts.rows) == len(plans.rows) == len(times.rows) == 9
+    assert [table.rows for table in measured_peer([]).tables] == [()] * 4
+
+
+def test_guides_that_order_our_search_are_refused_for_another_planner():
+    with pytest.raises(BenchmarkError, match="order orders our search"):
+        Settings(seed=1, by="rai", guides=("order",))

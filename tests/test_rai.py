@@ -11,7 +11,9 @@ import pytest
 from relevance.cli import main
 from relevance.planner import Guide
 from relevance.planner.rai import planner as peer
-from relevance.planner.rai.planner import PeerError, RaiConfig, plan_rai, rai_problem
+from relevance.planner.rai import problem
+from relevance.planner.rai.planner import PeerError, RaiConfig, plan_rai
+from relevance.planner.rai.problem import rai_problem
 from relevance.scene import Box, Scene, SceneError, goal_holds, scene_to_json
 from relevance.simulation import replay
 
@@ -38,7 +40,7 @@ SCENE = Scene(
 @pytest.fixture
 def texts(monkeypatch, tmp_path):
     """A problem in rai's words, where rai need not be installed."""
-    monkeypatch.setattr(peer, "_models", lambda: tmp_path)
+    monkeypatch.setattr(problem, "_models", lambda: tmp_path)
     return lambda text, movable=SCENE.names: rai_problem(SCENE, SCENE.goal(text), movable=movable)
 
 
@@ -54,11 +56,25 @@ def test_facts_say_who_can_be_moved_and_where_to(texts):
     assert facts(beside, "box2") == ["clear", "is_object", "is_blocker"]
     assert facts(beside, "table") == ["is_table", "clear", "is_base"]
     on = texts("on(red, blue)")
-    assert facts(on, "box1") == ["is_object", "is_blocker", "is_base"]
-    assert facts(on, "table") == ["is_table", "clear"]
+    assert facts(on, "box1") == ["is_object", "is_blocker"]  # there may be room beside green
+    assert facts(on, "table") == ["is_table", "clear", "is_base"]
     assert "target (box1)" in on.configuration
     pruned = texts("on(red, blue)", movable={"red", "blue"})
     assert facts(pruned, "box2") == ["clear"]
+
+
+def test_what_carries_the_subject_has_to_be_gone_from_the_reference(monkeypatch, tmp_path):
+    monkeypatch.setattr(problem, "_models", lambda: tmp_path)
+    tower = Scene(
+        objects=(
+            box("blue", 0.0, 0.0, BLUE),
+            box("green", 0.0, 0.0, GREEN, size=(0.045, 0.045, 0.05), bottom=0.06, on="blue"),
+            box("red", 0.0, 0.0, RED, size=(0.04, 0.04, 0.04), bottom=0.11, on="green"),
+        )
+    )
+    found = rai_problem(tower, tower.goal("on(red, blue)"), movable=tower.names)
+    assert "is_base" in facts(found, "box0")
+    assert "is_base" not in facts(found, "table")
 
 
 def test_boxes_turn_so_that_rai_takes_them_across_their_narrow_edge(texts):
@@ -74,6 +90,11 @@ def test_every_part_of_the_hand_keeps_clear_of_every_box_and_carriers_are_left_o
     assert len(pairs["hand"]) == 3 * len(parts)
     between = {frozenset(pair[2:]) for pair in pairs["boxes"] if pair[2] != pair[3]}
     assert between == {frozenset({"box0", "box1"}), frozenset({"box0", "box2"})}
+    few = texts("on-the-left(red, blue)", movable={"red", "blue"}).pairs
+    assert few["hand"] == pairs["hand"]  # what stays is an obstacle
+    assert few["boxes"] == [pair for pair in pairs["boxes"] if "box0" in pair[2:]]
+    none = texts("on-the-left(red, blue)", movable={"blue"}).pairs
+    assert none["boxes"] == []  # two that stay never come any nearer
 
 
 def test_settings_and_input_are_refused_in_one_line(monkeypatch):
@@ -104,6 +125,13 @@ def test_without_the_extra_one_line_says_how_to_get_it(monkeypatch, tmp_path, ca
         assert "pip install 'relevance[rai]'" in error
         assert len(error.strip().splitlines()) == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_sequences_are_counted_once_each():
+    spent = peer._Spent()
+    for line in ("+++ solving sub-plan a", "+++ solving sub-plan b", "+++ solving sub-plan a"):
+        peer._count(line, spent)
+    assert (spent.counts.keyframe, spent.counts.sequences) == (3, 2)
 
 
 @installed
@@ -146,6 +174,8 @@ def test_a_guide_restricts_what_rai_moves():
     guide = Guide(scorer=Nothing(), mode="prune")
     pruned = plan_rai(SCENE, "on(red, blue)", config=RaiConfig(seconds=20, rounds=1), guide=guide)
     assert pruned.status == "infeasible"  # green stands on blue and may not be moved
+    assert pruned.looked
+    assert pruned.seconds.total > pruned.seconds.guide > 0
 
 
 @installed

@@ -7,7 +7,8 @@ unless a name says wall; intervals are 95%: bootstrap for times, Wilson for shar
 
 from relevance.benchmarks.against import find_unsolved, measure_against
 from relevance.benchmarks.completeness import measure_completeness
-from relevance.benchmarks.guides import LIMITS, Rerun, Settings, read_reruns, rerun_guides
+from relevance.benchmarks.guides import LIMITS, OURS, Rerun, Settings, read_reruns, rerun_guides
+from relevance.benchmarks.peers import measured_peer
 from relevance.benchmarks.plots import save
 from relevance.benchmarks.runs import Measured
 from relevance.benchmarks.savings import Figures, figures, measured_guides
@@ -27,6 +28,7 @@ __all__ = [
     "CAPPED",
     "LIMITS",
     "MAX_EDGE",
+    "OURS",
     "SIZES",
     "BenchmarkError",
     "Figures",
@@ -46,6 +48,7 @@ __all__ = [
     "measure_stability",
     "measure_versus",
     "measured_guides",
+    "measured_peer",
     "read_reruns",
     "rerun_guides",
     "save",

@@ -9,6 +9,11 @@ in `evaluation.pairing`.
 - True labels are what the plan moves that the informed search finds, all plans of its length
   compared.
 - Tasks at the node limit count as they ran.
+
+With another planner (`Settings.by`) all of it is that planner's: a task that it does not solve
+unguided is not asked further, the plans on both sides are judged by the replay, and there is one
+prior more: what its own unguided plan moves, which knows what true labels, those of our planner's
+plans, say of another planner's.
 """
 
 from __future__ import annotations
@@ -17,6 +22,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 from relevance.benchmarks.runs import Progress
 from relevance.benchmarks.searches import MAX_EDGE, MOST_ACTIONS, SIZES
@@ -26,20 +32,36 @@ from relevance.evaluation import (
     TRUE,
     Asked,
     NetworkScorer,
+    Pair,
+    Timed,
+    beside_another,
     prior_name,
     prior_scorer,
     side_by_side,
 )
-from relevance.planner import GUIDES, PLANNER_VERSION, PlannerConfig, Scorer, plan, warm_up
+from relevance.planner import (
+    GUIDES,
+    PLANNER_VERSION,
+    PLANNERS,
+    PlannerConfig,
+    PlanResult,
+    Scorer,
+    plan,
+    warm_up,
+)
 from relevance.sampling import sample_goals
-from relevance.scene import Scene
-from relevance.simulation import Renderer
+from relevance.scene import Goal, Scene
+from relevance.simulation import Renderer, replay
 
 ROWS, SETTINGS = "guides.jsonl", "settings.json"
 """Files of a run: its rows as they were made, and what makes them."""
 NODE_LIMIT = 200_000
 LIMITS = PlannerConfig(max_actions=MOST_ACTIONS, node_limit=NODE_LIMIT)
 _STREAM = "bench guides"
+OURS = "ours"
+"""Name of our planner."""
+OWN_PLAN = "own plan"
+"""Name of the prior that knows what another planner's unguided plan moves."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,11 +79,20 @@ class Settings:
     """Timed runs of each task and guide; the median counts."""
     planner: PlannerConfig = LIMITS
     """Limits; its search is overridden by each of the ones above."""
+    by: str = OURS
+    """Whose planner is guided, a name in PLANNERS; searches are ours alone."""
+    peer: Any = None
+    """Settings of another planner."""
 
     def __post_init__(self) -> None:
         for name in self.guides:
             if not GUIDES[name].guided:
                 raise BenchmarkError(f"guides: {name} asks for no scores, expected one that does")
+            if self.by != OURS and GUIDES[name].walk != "levels":
+                raise BenchmarkError(
+                    f"guides: {name} orders our search, expected one that says what {self.by} may "
+                    "move"
+                )
         for name in ("priors", "guides", "searches"):
             given = [prior_name(each) for each in getattr(self, name)]
             if not given or len(set(given)) < len(given):
@@ -109,6 +140,9 @@ class Rerun:
     solved_guided: bool
     truth: bool
     """Whether a plan was known to the oracle."""
+    replays_unguided: bool | None = None
+    """Whether the replay confirms the plan; None for ours, which checks them itself."""
+    replays_guided: bool | None = None
 
 
 _COLUMNS = tuple(field.name for field in fields(Rerun))
@@ -132,8 +166,7 @@ def rerun_guides(
     _claim(folder, settings, scorers)
     rows = read_reruns(folder)
     lacking = {size: Tasks(size, tasks, settings) for size in sizes}
-    each = len(settings.searches) * len(settings.guides) * len({*settings.priors, TRUE})
-    counts = {size: sum(row.size == size for row in rows) // each for size in sizes}
+    counts = {size: len({row.task for row in rows if row.size == size}) for size in sizes}
     done, total = sum(min(count, tasks) for count in counts.values()), tasks * len(sizes)
     progress(done, total)
     if done < total:
@@ -198,15 +231,12 @@ def _rerun(
     task: Task, size: int, scorers: Mapping[str, Scorer], settings: Settings
 ) -> Iterator[Rerun]:
     """The rows of a task."""
+    if settings.by != OURS:
+        yield from _rerun_peer(task, size, scorers, settings)
+        return
     scene, goal = task.scene, task.goal
-    true = plan(scene, goal, config=replace(settings.planner, search="informed"), replay=False)
-    moved = true.moved if true.status == "solved" else ()
-    priors = {
-        name: prior_scorer(name, moved) if name in PRIORS else scorers[name]
-        for name in dict.fromkeys((*settings.priors, TRUE))
-    }
-    for prior in priors.values():  # heads are loaded when they are first asked
-        prior.scores(scene, goal)
+    true = _true(scene, goal, settings)
+    priors = _priors(scene, goal, scorers, settings, true)
     asked = [
         Asked(prior=name, scorer=prior, mode=guide)
         for name, prior in priors.items()
@@ -216,19 +246,80 @@ def _rerun(
         planner = replace(settings.planner, search=search)
         pairs = side_by_side(scene, goal, asked, planner, turn=task.index, repeats=settings.repeats)
         for pair in pairs:
-            made = pair.row(scene, goal) | {
-                "size": size,
-                "task": task.index,
-                "goal": str(goal),
-                "search": search,
-                "patience": pair.asked.guide.patience,
-                "status_unguided": pair.unguided.result.status,
-                "status_guided": pair.guided.result.status,
-                "work_unguided": pair.unguided.result.counts.work,
-                "work_guided": pair.guided.result.counts.work,
-                "truth": true.status == "solved",
-            }
-            yield Rerun(**{name: made[name] for name in _COLUMNS})
+            yield _row(task, size, search, pair, true)
+
+
+def _true(scene: Scene, goal: Goal, settings: Settings) -> PlanResult:
+    """The plan that true labels are of."""
+    return plan(scene, goal, config=replace(settings.planner, search="informed"), replay=False)
+
+
+def _priors(
+    scene: Scene,
+    goal: Goal,
+    scorers: Mapping[str, Scorer],
+    settings: Settings,
+    true: PlanResult,
+) -> dict[str, Scorer]:
+    moved = true.moved if true.status == "solved" else ()
+    priors = {
+        name: prior_scorer(name, moved) if name in PRIORS else scorers[name]
+        for name in dict.fromkeys((*settings.priors, TRUE))
+    }
+    for prior in priors.values():  # heads are loaded when they are first asked
+        prior.scores(scene, goal)
+    return priors
+
+
+def _rerun_peer(
+    task: Task, size: int, scorers: Mapping[str, Scorer], settings: Settings
+) -> Iterator[Rerun]:
+    """The rows of a task by another planner; one, of no prior, where it finds no plan unguided."""
+    scene, goal = task.scene, task.goal
+    true = _true(scene, goal, settings)
+    priors = _priors(scene, goal, scorers, settings, true)
+
+    def asked(found: PlanResult) -> list[Asked]:
+        every = {**priors, OWN_PLAN: prior_scorer(TRUE, found.moved)}
+        return [
+            Asked(prior=name, scorer=prior, mode=guide)
+            for name, prior in every.items()
+            for guide in settings.guides
+        ]
+
+    peer = PLANNERS[settings.by]
+    unguided, pairs = beside_another(peer, scene, goal, asked, settings.peer, turn=task.index)
+    if not pairs:
+        alone = Asked(prior="none", scorer=priors[TRUE], mode="none")
+        pairs = [Pair(asked=alone, stop="first", unguided=unguided, guided=unguided)]
+    holds = _replays(scene, goal, unguided)
+    for pair in pairs:
+        row = _row(task, size, settings.by, pair, true)
+        guided = holds if pair.guided is unguided else _replays(scene, goal, pair.guided)
+        # what `Counts.work` weighs is our planner's
+        yield replace(
+            row, work_unguided=0, work_guided=0, replays_unguided=holds, replays_guided=guided
+        )
+
+
+def _replays(scene: Scene, goal: Goal, found: Timed) -> bool | None:
+    return replay(scene, goal, found.result.phases).ok if found.solved else None
+
+
+def _row(task: Task, size: int, search: str, pair: Pair, true: PlanResult) -> Rerun:
+    made = pair.row(task.scene, task.goal) | {
+        "size": size,
+        "task": task.index,
+        "goal": str(task.goal),
+        "search": search,
+        "patience": pair.asked.guide.patience,
+        "status_unguided": pair.unguided.result.status,
+        "status_guided": pair.guided.result.status,
+        "work_unguided": pair.unguided.result.counts.work,
+        "work_guided": pair.guided.result.counts.work,
+        "truth": true.status == "solved",
+    }
+    return Rerun(**{name: made[name] for name in _COLUMNS if name in made})
 
 
 # --- files ----------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """The subcommands `bench planner`, `bench guides`, `bench dataset` and `bench training`."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
+import math
 import os
 import secrets
 import tempfile
@@ -12,9 +13,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from relevance.cli.arguments import Command, Preset, at_least, one_of
+from relevance.cli.arguments import Command, Preset, at_least, one_of, settings_of
 from relevance.cli.bench import bench_planner, hand_over, write, write_scenes
-from relevance.cli.terminal import bar, say
+from relevance.cli.terminal import UsageError, bar, say
 
 Part = Literal["making", "reading", "queries", "crashes"]
 PARTS: tuple[Part, ...] = ("making", "reading", "queries", "crashes")
@@ -34,11 +35,13 @@ def _guides(_: Preset) -> Callable[..., int]:
         goals: int = 5,
         sizes: Sizes = (3, 5, 10, 15, 20, 30),
         priors: Names = ("glimpse",),
-        guides: Names = ("order", "lazy"),
+        guides: Names = (),
         searches: tuple[Literal["tree", "informed"], ...] = ("tree", "informed"),
         node_limit: int = 200_000,
         max_actions: int = 12,
         repeats: int = 1,
+        planner: str = "ours",
+        seconds: float = 30.0,
         seed: OptionalSeed = None,
         out: OptionalFolder = None,
     ) -> int:
@@ -57,14 +60,20 @@ def _guides(_: Preset) -> Callable[..., int]:
                 (model.pt), or true, all, none, random, distance, swept. True labels are always
                 rerun.
             guides: How the scores enter the search: prune, prune-then-full, expand, order,
-                shortest, lazy.
+                shortest, lazy; order and lazy when not given, of another planner prune-then-full.
             searches: The paper's breadth-first tree, our informed search, or both.
             node_limit: Most nodes that a search may open for a goal.
             max_actions: Most picks and places in a plan.
             repeats: Timed runs of each task and guide; the median counts.
+            planner: Whose planner is guided: ours, or another of relevance.planner.PLANNERS (rai),
+                once a guide: what it solves unguided is asked further, the replay judges its
+                plans. Then searches, node limit and repeats mean nothing.
+            seconds: CPU seconds that another planner has for a task and a guide.
             seed: Remakes the tasks of an earlier run; a fresh one when not given.
             out: Folder for rows, tables and plots; data/bench/guides-SEED when not given.
         """
+        from relevance.planner import PLANNERS, PlannerConfig
+
         for flag, count in (("tasks", tasks), ("goals", goals), ("node-limit", node_limit)):
             at_least(f"--{flag}", count, 1)
         at_least("--max-actions", max_actions, 2)
@@ -72,22 +81,29 @@ def _guides(_: Preset) -> Callable[..., int]:
         at_least("--seed", seed, 0, 2**31)
         for size in sizes:
             at_least("--sizes", size, 3)
+        if not 0 < seconds < math.inf:
+            raise UsageError(f"--seconds {seconds}: expected a number over 0")
+        PLANNERS[planner].require()
         seed = secrets.randbits(31) if seed is None else seed
         folder = out or Path("data/bench") / f"guides-{seed}"
         folder.mkdir(parents=True, exist_ok=True)
         say(f"seed {seed}, pid {os.getpid()}, to {folder}")
         from relevance import benchmarks
-        from relevance.planner import PlannerConfig
 
+        ours = planner == benchmarks.OURS
+        limits = PlannerConfig(node_limit=node_limit, max_actions=max_actions)
         settings = benchmarks.Settings(
             seed=seed,
             goals=goals,
             searches=searches,
             priors=priors,
-            guides=guides,
+            guides=guides or (("order", "lazy") if ours else ("prune-then-full",)),
             repeats=repeats,
-            planner=PlannerConfig(node_limit=node_limit, max_actions=max_actions),
+            planner=limits,
+            by=planner,
+            peer=None if ours else settings_of(PLANNERS[planner].Config, seconds=seconds),
         )
+        measured = benchmarks.measured_guides if ours else benchmarks.measured_peer
         rows, due = [], time.monotonic() + EVERY
         with bar("tasks") as progress:
             for rows in benchmarks.rerun_guides(
@@ -99,10 +115,10 @@ def _guides(_: Preset) -> Callable[..., int]:
                 progress=progress,
             ):
                 if (began := time.monotonic()) > due:
-                    write(benchmarks.measured_guides(rows), folder, summary=True)
+                    write(measured(rows), folder, summary=True)
                     took = time.monotonic() - began
                     due = began + took + max(EVERY, took / SHARE)
-        hand_over(benchmarks.measured_guides(rows), folder, summary=True)
+        hand_over(measured(rows), folder, summary=True)
         return 0
 
     return bench

@@ -40,7 +40,7 @@ from relevance.evaluation.coverage import (
     out_of_reach,
     read_calibration,
 )
-from relevance.evaluation.pairing import Asked, Pair, Timed, side_by_side
+from relevance.evaluation.pairing import Asked, Pair, Timed, beside_another, side_by_side
 from relevance.evaluation.pictures import PictureError, Seen, look_at
 from relevance.evaluation.predictions import policy_of_checkpoint, predict, unjudged
 from relevance.evaluation.priors import PRIORS, TRUE, Believing, Prior, prior_name, prior_scorer
@@ -103,6 +103,7 @@ __all__ = [
     "accuracy_table",
     "amortised_costs",
     "away",
+    "beside_another",
     "breakdown_table",
     "calibrate",
     "checkpoint_id",

@@ -7,15 +7,14 @@
 - All of it counts: guided time includes the network and every fallback. The scene is encoded anew
   in each run, as though its goal came alone; `seconds_encoding` is what further goals of the scene
   would not pay again. The picture itself is the camera's work and is not timed.
-- CPU time (`time.process_time`, all threads; networks have one), so that a shared machine does not
-  blur it.
+- CPU time as the planner has it (all threads; networks have one), so that a shared machine does not
+  blur it. rai works in a subprocess: its time there counts, that of loading it does not.
 - The replay of a plan is on neither side: both would pay the same for it.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -26,11 +25,12 @@ from relevance.evaluation.scorer import NetworkScorer, guide_by
 from relevance.planner import (
     GUIDES,
     PLANNER_VERSION,
+    PLANNERS,
     Guide,
+    Planner,
     PlannerConfig,
     PlanResult,
     Scorer,
-    plan,
 )
 from relevance.scene import Goal, Scene
 
@@ -67,8 +67,8 @@ class Timed:
 
     @property
     def solved(self) -> bool:
-        """Whether there is a plan that the planner's own check confirms."""
-        return self.result.status == "solved" and self.result.check_ok
+        """Whether there is a plan."""
+        return self.result.status == "solved"
 
     @property
     def length(self) -> int | None:
@@ -126,7 +126,7 @@ def side_by_side(
     scene: Scene,
     goal: Goal,
     asked: Sequence[Asked],
-    planner: PlannerConfig,
+    config: PlannerConfig,
     *,
     turn: int = 0,
     repeats: int = 1,
@@ -136,22 +136,23 @@ def side_by_side(
     `turn` rotates who goes first; of `repeats` the median counts. Every scorer has to have seen
     the scene.
     """
-    stops: list[Stop] = ["first" if GUIDES[each.mode].first else planner.stop for each in asked]
+    stops: list[Stop] = ["first" if GUIDES[each.mode].first else config.stop for each in asked]
     ways: list[tuple[Guide | None, PlannerConfig]] = [
-        (None, replace(planner, stop=stop)) for stop in dict.fromkeys(stops)
+        (None, replace(config, stop=stop)) for stop in dict.fromkeys(stops)
     ]
-    ways += [(each.guide, planner) for each in asked]
+    ways += [(each.guide, config) for each in asked]
+    ours = PLANNERS["ours"]
     runs: list[list[Timed]] = [[] for _ in ways]
     for repeat in range(repeats):
         for position in range(len(ways)):
             which = (position + turn + repeat) % len(ways)
-            guide, config = ways[which]
-            runs[which].append(_timed(scene, goal, config, guide))
-    timed = [_middle(some) for some in runs]
-    unguided: Mapping[Stop, Timed] = dict(zip(dict.fromkeys(stops), timed, strict=False))
+            guide, its = ways[which]
+            runs[which].append(timed(ours, scene, goal, its, guide))
+    middle = [_middle(some) for some in runs]
+    unguided: Mapping[Stop, Timed] = dict(zip(dict.fromkeys(stops), middle, strict=False))
     return [
         Pair(asked=each, stop=stop, unguided=unguided[stop], guided=found)
-        for each, stop, found in zip(asked, stops, timed[len(unguided) :], strict=True)
+        for each, stop, found in zip(asked, stops, middle[len(unguided) :], strict=True)
     ]
 
 
@@ -166,12 +167,44 @@ def _middle(runs: Sequence[Timed]) -> Timed:
     )
 
 
-def _timed(scene: Scene, goal: Goal, config: PlannerConfig, guide: Guide | None) -> Timed:
+def beside_another(
+    planner: Planner,
+    scene: Scene,
+    goal: Goal,
+    asked: Callable[[PlanResult], Sequence[Asked]],
+    config: Any,
+    *,
+    turn: int = 0,
+) -> tuple[Timed, list[Pair]]:
+    """Plan a task by another planner, unguided and then in every way that is asked for, given what
+    it found; one pair a way, none where it finds no plan. Its first plan counts.
+
+    `turn` rotates who goes first of the guided ones.
+    """
+    unguided = timed(planner, scene, goal, config)
+    ways = asked(unguided.result) if unguided.solved else []
+    found: dict[int, Timed] = {}
+    for position in range(len(ways)):
+        which = (position + turn) % len(ways)
+        found[which] = timed(planner, scene, goal, config, ways[which].guide)
+    return unguided, [
+        Pair(asked=each, stop="first", unguided=unguided, guided=found[which])
+        for which, each in enumerate(ways)
+    ]
+
+
+def timed(
+    planner: Planner, scene: Scene, goal: Goal, config: Any, guide: Guide | None = None
+) -> Timed:
+    """One run, without the replay of its plan."""
     network = guide.scorer if guide and isinstance(guide.scorer, NetworkScorer) else None
     if network:
         network.forget()
-    start = time.process_time()
-    result = plan(scene, goal, config=config, guide=guide, replay=False)
-    seconds = time.process_time() - start
+    result = planner.plan(scene, goal, config=config, guide=guide, replay=False)
     encoding = network.seconds_encoding if network and result.looked else 0.0
-    return Timed(result=result, seconds=seconds, look=result.seconds.guide, encoding=encoding)
+    return Timed(
+        result=result,
+        seconds=result.seconds.total,
+        look=result.seconds.guide,
+        encoding=encoding,
+    )

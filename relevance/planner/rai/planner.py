@@ -9,7 +9,8 @@ action sequences.
 How the tasks differ from ours: rai takes a box across its narrower edge only, at any tilt; each
 box is moved once, blockers go to the table; for goals beside a reference that reference stays.
 Boxes are rounded (1 cm) against the hand, and 4 mm against each other with some room added to
-their footprints. Its plans are judged by `simulation.replay`, like ours.
+their footprints. Two boxes that both stay are no pair that rai looks at, so that a guide makes its
+problems smaller, too. Its plans are judged by `simulation.replay`, like ours.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+import time
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,6 +38,7 @@ from relevance.configs import config
 from relevance.errors import RelevanceError
 from relevance.planner.guides import Guide, ask, rounds
 from relevance.planner.kernels.rows import SPEED, STEP
+from relevance.planner.rai.problem import RaiProblem, goal_region, rai_problem
 from relevance.planner.result import (
     Counts,
     PlanResult,
@@ -43,79 +46,21 @@ from relevance.planner.result import (
     movable_names,
     replayed,
 )
-from relevance.robot import ARM, HOME, LINKS, panda
+from relevance.robot import panda
 from relevance.scene import (
     Action,
-    Box,
     Goal,
     Phase,
     Pose,
-    Rectangle,
-    Region,
     Scene,
-    footprint_gap,
     goal_holds,
 )
 
-ROUND = 0.01
-"""Corner radius of boxes against the hand, m; rai's solver needs it to slide along edges."""
-ROUND_BOX = 0.004
-"""Corner radius of boxes against each other, m."""
-ROOM = 0.0008
-"""How far a box's footprint is grown against others beyond its rounded corners, m."""
-SKIN = 0.001
-"""How far the parts of the hand are grown, m."""
-REGION_MARGIN = 0.002
-"""How far inside the goal region rai places a subject, m."""
 EXHAUSTED = "queue is empty"
 """What rai prints, for ever, once there is no further action sequence."""
 NO_SEQUENCE = "NO SEQUENCE"
 """What solver prints when the rules allow no action sequence at all."""
-_FRAMES = dict(zip(LINKS, ("l_panda_joint5", "l_panda_joint6", "l_panda_hand_joint"), strict=True))
-_FINGERS = {1.0: "l_panda_finger_joint1", -1.0: "l_panda_finger_joint2"}
-_FINGER_ROOT = 0.0584  # of both finger frames, along the hand's z, m
 _STARTUP = 30.0  # wall seconds for Python and rai to load on a busy machine
-_RULES = """\
-is_gripper
-is_object
-is_box
-is_sphere
-is_capsule
-is_blocker
-is_subject
-is_table
-is_target
-is_base
-partOf
-on
-busy
-clear
-done
-
-START_STATE {}
-
-DecisionRule pick_box {
-  Obj, From, Hand,
-  pre: { (is_gripper Hand) (is_object Obj) (on From Obj) (clear Obj) (busy Hand)! (done Obj)! }
-  eff: { (on From Obj)! #deletes
-    (on Hand Obj) (busy Hand) (clear From) (done Obj) }
-}
-
-DecisionRule place_straightOn {
-  Obj, Hand, To,
-  pre: { (is_gripper Hand) (is_blocker Obj) (is_table To) (on Hand Obj) }
-  eff: { (busy Hand)! (on Hand Obj)! #deletes
-    (on To Obj) }
-}
-
-DecisionRule place_straightOn {
-  Obj, Hand, To, Under,
-  pre: { (is_gripper Hand) (is_subject Obj) (is_target To) (on Hand Obj)
-    (is_base Under) (clear Under) }
-  eff: { (busy Hand)! (on Hand Obj)! #deletes
-    (on To Obj) }
-}
-"""
 
 
 class PeerError(RelevanceError):
@@ -130,22 +75,6 @@ class RaiConfig:
     """CPU seconds for a goal; then the result is `limit`."""
     rounds: Annotated[int, Field(ge=1)] = 3
     """How often rai starts afresh, with another seed, when it ran out of action sequences."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RaiProblem:
-    """One goal as rai reads it: the text of its files, and what the answer is read with."""
-
-    configuration: str
-    rules: str
-    search: str
-    pairs: Mapping[str, list[list[str]]]
-    """Collision pairs: [part of the hand, box] under `hand`, [shape, shape, box, box] under
-    `boxes`, [part, shape] under `fixed`."""
-    names: Mapping[str, str]
-    """From rai's names of boxes and places to ours."""
-    turn: Mapping[str, float]
-    """By our name: how far rai's box is turned about z, since rai takes boxes across their y."""
 
 
 def require_rai() -> None:
@@ -167,9 +96,10 @@ def plan_rai(
 
     A guide restricts what rai may move (those that order the search have no effect on it); its
     last round has the whole seconds. `seconds.total` is the CPU time of the subprocess without
-    loading Python and rai; counts are rai's waypoint problems (keyframe), motif samples (pose),
-    motions (path) and action sequences (nodes). `check_ok` stays False: rai's plans are for the
-    replay to judge.
+    loading Python and rai, and that of the look; counts are rai's waypoint problems (keyframe) and
+    how many action sequences they are of (sequences), motif samples (pose), problems of motions
+    (path) and sequences whose waypoints were found (nodes). `check_ok` stays False: rai's plans are
+    for the replay to judge.
     Raises PeerError where rai is missing, SceneError for an unknown predicate or object.
     """
     require_rai()
@@ -189,11 +119,22 @@ def _plan(
         return PlanResult(
             goal=goal, status="solved", final={}, cost=0.0, counts=Counts(), seconds=Seconds()
         )
+    began = time.process_time()
     scores = ask(guide, scene, goal)
-    *early, last = rounds(everything, goal, guide, scores)
+    look = time.process_time() - began
+    result = _rounds(scene, goal, config, rounds(everything, goal, guide, scores))
+    seconds = replace(result.seconds, guide=look, total=result.seconds.total + look)
+    return replace(result, seconds=seconds, looked=bool(scores))
+
+
+def _rounds(
+    scene: Scene, goal: Goal, config: RaiConfig, allowed: Sequence[frozenset[str]]
+) -> PlanResult:
+    """An attempt for each of the sets that may move, until one succeeds."""
+    *early, last = allowed
     spent, end = _Spent(), config.seconds
-    for allowed in early:  # these share the seconds, the last round has them whole
-        result = _attempt(scene, goal, allowed, config, spent, end)
+    for some in early:  # these share the seconds, the last round has them whole
+        result = _attempt(scene, goal, some, config, spent, end)
         if result.status == "solved":
             return result
         if spent.seconds.total >= end:
@@ -235,6 +176,8 @@ class _Spent:
 
     counts: Counts = field(default_factory=Counts)
     seconds: Seconds = field(default_factory=Seconds)
+    sequences: set[str] = field(default_factory=set)
+    """Those whose switches were sought."""
 
 
 def _attempt(
@@ -251,7 +194,7 @@ def _attempt(
     """
     problems = [
         rai_problem(scene, goal, movable=movable, there=there)
-        for there in _region(scene, goal).rectangles
+        for there in goal_region(scene, goal).rectangles
     ]
     ended = {number: ("", False) for number in range(len(problems))}
     for seed in range(config.rounds):
@@ -302,7 +245,7 @@ def _run(
         ended, last = "", ""
         try:
             for line in process.stdout:
-                _count(line, spent.counts)
+                _count(line, spent)
                 ended = next((w for w in (EXHAUSTED, NO_SEQUENCE) if w in line), "")
                 if ended:
                     process.kill()
@@ -338,11 +281,14 @@ def _children() -> float:
     return usage.ru_utime + usage.ru_stime
 
 
-def _count(line: str, counts: Counts) -> None:
+def _count(line: str, spent: _Spent) -> None:
+    counts = spent.counts
     if line.startswith("+++ solving motif"):
         counts.pose += 1
     elif line.startswith("+++ solving sub-plan"):
         counts.keyframe += 1
+        spent.sequences.add(line)
+        counts.sequences = len(spent.sequences)
     elif line.startswith("MOTION"):
         counts.path += 1
     elif line.startswith("SEQUENCE"):
@@ -403,178 +349,3 @@ def _solved(
 def _acceleration(q: np.ndarray) -> float:
     """Squared second differences at rest before and after, as in PlanResult.cost, rad^2."""
     return float((np.diff(np.vstack([q[:1], q, q[-1:]]), n=2, axis=0) ** 2).sum())
-
-
-def rai_problem(
-    scene: Scene, goal: Goal, *, movable: Collection[str], there: Rectangle | None = None
-) -> RaiProblem:
-    """Write a goal in rai's formats; boxes outside `movable` stay where they are.
-
-    there: the part of the goal region that is meant (None: its first rectangle).
-    """
-    ids = {box.name: f"box{i}" for i, box in enumerate(scene.objects)}
-    on = goal.predicate.stacked
-    parts, lines = _hand()
-    lines = [*_world(scene, "is_table, clear" if on else "is_table, clear, is_base"), *lines]
-    turn = {box.name: math.pi / 2 if box.size[0] < box.size[1] else 0.0 for box in scene.objects}
-    places = {"target": goal.reference if on else "table", "table": "table"}
-    carrying = {name for box in scene.objects for name in box.supports}
-    for box in scene.objects:
-        facts = [] if box.name in carrying else ["clear"]
-        stays = box.name not in movable or (box.name == goal.reference and not on)
-        if not stays and min(box.size[:2]) <= 2 * panda().max_opening:
-            facts += ["is_object", "is_subject" if box.name == goal.subject else "is_blocker"]
-        if on and box.name == goal.reference:
-            facts.append("is_base")
-        lines += _box(box, scene, ids, turn, facts)
-    there = there or _region(scene, goal).rectangles[0]
-    lines.append(_target(scene, goal, there, ids[goal.reference], turn))
-    pairs: dict[str, list[list[str]]] = {"hand": [], "boxes": [], "fixed": []}
-    pairs["hand"] = [[part, rai_name] for rai_name in ids.values() for part in parts]
-    pairs["fixed"] = [[part, "slab"] for part in parts]
-    for i, a in enumerate(scene.objects):
-        pairs["boxes"].append([ids[a.name], "foot", ids[a.name], ids[a.name]])
-        for b in scene.objects[:i]:
-            if b.name in a.supports or a.name in b.supports:
-                continue
-            # Boxes that stand closer than their grown shapes allow are kept apart as they are.
-            close = footprint_gap(a, b) < 2 * _growth() + 2e-4
-            prefix = "" if close else "wide_"
-            pair = [ids[a.name], ids[b.name]]
-            pairs["boxes"].append([*(f"{prefix}{rai_name}" for rai_name in pair), *pair])
-    listed = [pair[:2] for kind in ("hand", "boxes", "fixed") for pair in pairs[kind]]
-    search = "\n".join(
-        [
-            "fol: <task.fol>",
-            f'terminal: "(on target {ids[goal.subject]})"',
-            "genericCollisions: false",
-            f"coll: [{' '.join(name for pair in listed for name in pair)}]",
-            "",
-        ]
-    )
-    return RaiProblem(
-        configuration="\n".join(lines) + "\n",
-        rules=_RULES,
-        search=search,
-        pairs=pairs,
-        names={**{rai_name: name for name, rai_name in ids.items()}, **places},
-        turn=turn,
-    )
-
-
-def _models() -> Path:
-    """The folder of rai's robot models, found without importing rai."""
-    found = importlib.util.find_spec("robotic")
-    assert found, "require_rai comes first"
-    return Path(found.origin or "").parent / "rai-robotModels"
-
-
-def _growth() -> float:
-    """How far a rounded box is grown to each side to hold the true one, and some room, m."""
-    return ROUND_BOX * (1 - 1 / math.sqrt(2)) + ROOM
-
-
-def _world(scene: Scene, facts: str) -> list[str]:
-    """Table, robot base and the robot's foot."""
-    x, y = scene.table.size
-    # rai keeps a box's centre over its support: the edge is as far away as its widest corner.
-    spare = max(math.hypot(*box.size[:2]) for box in scene.objects)
-    inner = (max(x - spare, 0.02), max(y - spare, 0.02))
-    base, yaw = scene.robot.base, scene.robot.yaw
-    centre, half = panda().foot
-    table = _shape((0, 0, -0.05), (*inner, 0.1), 0.001, logical=f"{{ {facts} }}")
-    return [
-        "world: {}",
-        f"table (world): {table}",
-        f"slab (world): {_shape((0, 0, -0.05), (x, y, 0.1), 0.001)}",
-        'Prefix: "l_"',
-        f"Include: <{_models() / 'panda' / 'panda.g'}>",
-        "Prefix: False",
-        f"Edit l_panda_base (world): {{ Q: [{_row((*base, *_turned(yaw)))}] }}",
-        *(f"Edit l_panda_joint{i + 1}: {{ q: {HOME[i]:.9f} }}" for i in range(ARM)),
-        "Edit l_panda_finger_joint1: { joint_active: True }",
-        f"foot (l_panda_base): {_shape(centre, 2 * half, 0.005)}",
-    ]
-
-
-def _hand() -> tuple[list[str], list[str]]:
-    """Names and lines of the boxes around wrist, hand and fingers."""
-    arm = panda()
-    boxes = [(_FRAMES[LINKS[link]], centre, half) for link, centre, half in arm.arm]
-    low = np.min([low for low, _ in arm.finger], axis=0)
-    high = np.max([high for _, high in arm.finger], axis=0)
-    x, y, z = (low + high) / 2
-    for side, frame in _FINGERS.items():
-        boxes.append((frame, np.array([x, side * y, z - _FINGER_ROOT]), (high - low) / 2))
-    names = [f"part{i}" for i in range(len(boxes))]
-    return names, [
-        f"{name} ({frame}): {_shape(centre, 2 * (half + SKIN), 0.005)}"
-        for name, (frame, centre, half) in zip(names, boxes, strict=True)
-    ]
-
-
-def _box(
-    box: Box, scene: Scene, ids: Mapping[str, str], turn: Mapping[str, float], facts: list[str]
-) -> list[str]:
-    x, y, z = box.size
-    size = (y, x, z) if turn[box.name] else (x, y, z)
-    yaw, position = box.yaw + turn[box.name], np.array(box.position)
-    support = next(iter(box.supports), None)
-    parent = "table" if support is None else ids[support]
-    if support is None:
-        position = position + np.array([0, 0, 0.05])
-    else:
-        below = scene[support]
-        angle = below.yaw + turn[support]
-        dx, dy, dz = position - np.array(below.position)
-        c, s = math.cos(angle), math.sin(angle)
-        position, yaw = np.array([c * dx + s * dy, c * dy - s * dx, dz]), yaw - angle
-    logical = f"{{ {', '.join(facts)} }}"
-    shape = _shape(position, size, ROUND, yaw=yaw, logical=logical)
-    wide = (size[0] + 2 * _growth(), size[1] + 2 * _growth(), size[2])
-    name = ids[box.name]
-    return [
-        f"{name} ({parent}): {shape[:-2]}, joint: rigid }}",
-        f"wide_{name} ({name}): {_shape((0, 0, 0), wide, ROUND_BOX)}",
-    ]
-
-
-def _region(scene: Scene, goal: Goal) -> Region:
-    return goal.predicate.region(scene[goal.subject], scene[goal.reference], scene.robot)
-
-
-def _target(
-    scene: Scene, goal: Goal, there: Rectangle, reference_id: str, turn: Mapping[str, float]
-) -> str:
-    """A part of the goal region as a thin plate in its support; the subject's centre must be over
-    it."""
-    thick = 0.002
-    extent = 2 * np.array(there.half) - 2 * REGION_MARGIN
-    if goal.predicate.stacked:
-        reference = scene[goal.reference]
-        yaw = reference.yaw + turn[reference.name]
-        c, s = math.cos(yaw), math.sin(yaw)
-        dx, dy = there.x - reference.position[0], there.y - reference.position[1]
-        parent, angle = reference_id, there.angle - yaw
-        centre = (c * dx + s * dy, c * dy - s * dx, (reference.size[2] - thick) / 2)
-    else:
-        parent, centre, angle = "table", (there.x, there.y, 0.05 - thick / 2), there.angle
-    size = (*np.maximum(extent, 2 * REGION_MARGIN), thick)
-    return f"target ({parent}): {_shape(centre, size, 0.0005, yaw=angle, logical='{ is_target }')}"
-
-
-def _shape(centre, size, radius: float, *, yaw: float = 0.0, logical: str = "") -> str:
-    """A rounded box in rai's words."""
-    radius = min(radius, 0.45 * float(min(size)))
-    text = f"{{ Q: [{_row((*centre, *_turned(yaw)))}], shape: ssBox"
-    text += f", size: [{_row((*size, radius))}]"
-    return f"{text}, logical: {logical} }}" if logical else f"{text} }}"
-
-
-def _turned(yaw: float) -> tuple[float, float, float, float]:
-    """Quaternion (w, x, y, z) of a turn about z."""
-    return math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
-
-
-def _row(values) -> str:
-    return ", ".join(f"{value:.9f}" for value in values)
