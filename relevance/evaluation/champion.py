@@ -31,7 +31,7 @@ from relevance.evaluation.predictions import (
 )
 from relevance.evaluation.scorer import EvaluationError, NetworkScorer, load_scorer
 from relevance.metrics import Interval, bootstrap, ratio_of_sums
-from relevance.networks import find_checkpoint, read_record, settle
+from relevance.networks import Learned, find_checkpoint, read_record, settle
 from relevance.pipeline import load_config
 from relevance.planner import GUIDES, Guide, PlannerConfig, plan
 from relevance.sampling import SAMPLER_VERSION, SceneConfig, sample_task
@@ -140,11 +140,11 @@ def contend(
     checkpoint: str | Path,
     config: TrialConfig | None = None,
     *,
-    learned: tuple[int, str] = (0, ""),
+    learned: Learned | None = None,
     progress: Progress | None = None,
 ) -> Trial | None:
     """Try a checkpoint against the champion and promote or refuse it, which the record keeps with
-    what it `learned` from (see `Event`).
+    what it `learned` from.
 
     Where another was promoted meanwhile, it is tried against that one. None where it is the
     champion itself.

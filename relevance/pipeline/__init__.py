@@ -17,6 +17,7 @@ from relevance.pipeline.settings import (
     shard_specs,
     shards_of,
 )
+from relevance.pipeline.shifting import Balance, balances, balances_between
 from relevance.pipeline.upkeep import REFUSED_LEAST, REFUSED_SHARE, finish, integrity
 from relevance.pipeline.work import (
     Job,
@@ -32,6 +33,7 @@ __all__ = [
     "LAYOUT",
     "REFUSED_LEAST",
     "REFUSED_SHARE",
+    "Balance",
     "Counts",
     "DatasetConfig",
     "Estimate",
@@ -43,6 +45,8 @@ __all__ = [
     "Work",
     "actual",
     "append",
+    "balances",
+    "balances_between",
     "beyond_repair",
     "describe",
     "do",

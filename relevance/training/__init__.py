@@ -38,7 +38,14 @@ from relevance.training.reading import Reader, TrainingError
 from relevance.training.settings import TRAINER_VERSION, TrainConfig
 from relevance.training.shipping import ship
 from relevance.training.speed import Speed, measure_speed
-from relevance.training.trainer import Trainer, measure, train, use_bfloat16
+from relevance.training.trainer import (
+    Trainer,
+    continued,
+    measure,
+    precision,
+    train,
+    use_bfloat16,
+)
 
 __all__ = [
     "CHECKPOINT_VERSION",
@@ -60,6 +67,7 @@ __all__ = [
     "batch_of",
     "checkpoint_id",
     "compare_looks",
+    "continued",
     "find_checkpoint",
     "graphs_of",
     "load_checkpoint",
@@ -68,6 +76,7 @@ __all__ = [
     "one_core",
     "pick_device",
     "polling",
+    "precision",
     "relevance_loss",
     "save_checkpoint",
     "ship",
