@@ -250,6 +250,20 @@ def test_a_real_trial_counts_bounds_and_no_clock(dataset):
     assert one.change is None
 
 
+@pytest.mark.parametrize(("guide", "stop"), [("order", "first"), ("shortest", "level")])
+def test_no_guide_stops_as_the_guide_does(dataset, monkeypatch, guide, stop):
+    stops = []
+
+    def spent(scene, goal, planner, guide):
+        stops.append((guide is None, planner.stop))
+        return 100, True
+
+    monkeypatch.setattr(champion, "_spent", spent)
+    monkeypatch.setattr(champion, "fresh_tasks", lambda *_: [(0, None), (1, None)])
+    contend(dataset.path, "glimpse", TrialConfig(tasks=2, guide=guide))
+    assert stops == [(False, stop), (True, stop)] * 2
+
+
 def test_the_command_promotes_rolls_back_and_shows(dataset, ids, capsys, ruled):
     root = str(dataset.path)
     ruled({None: 1000, "geometry": 500, "glimpse": 600})
