@@ -72,7 +72,7 @@ def flow_runs(url: str, *, limit: int = 100) -> list[FlowRun]:
 def artifacts(url: str, *, limit: int = 20) -> list[Artifact]:
     """The latest tables, pages and links that runs left, the newest first."""
     asked = {"sort": "UPDATED_DESC", "limit": limit}
-    asked |= {"artifacts": {"key": {"exists_": True}}}
+    asked |= {"artifacts": {"key": {"exists_": True}, "type": {"not_any_": ["progress"]}}}
     return [
         Artifact(
             key=found["key"],

@@ -51,6 +51,8 @@ def checkpoints() -> None:
     )
     if record.history:
         st.subheader("What became of those that were tried", anchor=False)
+        last = record.history[-1]
+        st.write(f"The last, {plain(last.checkpoint_id)}, was {last.what}: {plain(last.why)}.")
         st.dataframe(
             [
                 {
