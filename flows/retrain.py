@@ -86,7 +86,7 @@ def retrain(
     from relevance.evaluation import EvaluationConfig, TrialConfig
     from relevance.networks import read_record, refuse_remote
     from relevance.pipeline import fitting_preset, pending
-    from relevance.store import Dataset, sql
+    from relevance.store import Dataset, DatasetError, sql
     from relevance.training import TrainConfig, checkpoint_id
 
     root = absolute(dataset)
@@ -103,11 +103,15 @@ def retrain(
     config = configured(TrainConfig, preset, overrides)
     configured(EvaluationConfig, preset, evaluation)  # refused now, not after an hour of training
     trying = configured(TrialConfig, preset, trial)
-    name = checkpoint_id(there, config)
-    known = {row["checkpoint_id"] for row in there.read_rows("checkpoints")}
-    evaluated = {name for (name,) in sql(root, "select distinct checkpoint_id from evaluations")[1]}
-    record = read_record(there)
-    learned = _learned(there, config)
+    try:
+        name = checkpoint_id(there, config)
+        known = {row["checkpoint_id"] for row in there.read_rows("checkpoints")}
+        seen = sql(root, "select distinct checkpoint_id from evaluations")[1]
+        learned = _learned(there, config)
+    except DatasetError:
+        check(dataset=str(root), render=False)  # tells what is broken, and fails
+        raise
+    evaluated, record = {name for (name,) in seen}, read_record(there)
     done = name in known & evaluated and record.tried(name)
     if not force and (done or not enough(record, learned, least_new)):
         last = name if done else record.history[-1].checkpoint_id
