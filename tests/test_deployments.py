@@ -112,8 +112,13 @@ def test_a_shard_that_fails_starts_a_check(server: Server, tmp_path: Path) -> No
         run = wait_for(checked, 300, "the end of a check")
     assert run["state"]["type"] == "FAILED"
     assert "breaches of contract" in run["state"]["message"]
-    events = server.post("/events/filter", filter={"event": {"name": ["check.failed"]}})["events"]
-    assert str(data) in {event["payload"]["dataset"] for event in events}
+    name = {"filter": {"event": {"name": ["check.failed"]}}}
+
+    def told() -> bool:
+        events = server.post("/events/filter", **name)["events"]
+        return str(data) in {event["payload"]["dataset"] for event in events}
+
+    wait_for(told, 60, "its event")
 
 
 def test_a_cancelled_run_ends_its_pool(server: Server, tmp_path: Path) -> None:
