@@ -1,5 +1,6 @@
 """Prefect's API, as far as the page of runs reads it: plain HTTP, so that nothing is imported.
 
+(Prefect's own client takes 3.7 s of CPU to import, more than a page may take to its first figure.)
 The server is the one that PREFECT_API_URL names, else one of this machine at its usual port.
 """
 
@@ -16,7 +17,7 @@ from typing import Any
 from relevance.errors import RelevanceError
 
 USUAL = "http://127.0.0.1:4200/api"
-FLOWS = ("generate", "label", "train", "evaluate", "retrain", "demo")
+FLOWS = ("generate", "label", "check", "train", "evaluate", "retrain", "demo")
 """Those of this project; a server may have others."""
 _SECONDS = 5.0
 
@@ -71,7 +72,7 @@ def flow_runs(url: str, *, limit: int = 100) -> list[FlowRun]:
 def artifacts(url: str, *, limit: int = 20) -> list[Artifact]:
     """The latest tables, pages and links that runs left, the newest first."""
     asked = {"sort": "UPDATED_DESC", "limit": limit}
-    asked |= {"artifacts": {"key": {"exists_": True}}}
+    asked |= {"artifacts": {"key": {"exists_": True}, "type": {"not_any_": ["progress"]}}}
     return [
         Artifact(
             key=found["key"],

@@ -1,4 +1,4 @@
-"""Prefect flows over the stages: generate, label, train, evaluate, reproduce, retrain.
+"""Prefect flows over the stages: generate, label, check, train, evaluate, reproduce, retrain.
 
 Prefect is glue here: a flow resolves its parameters, runs one task per shard and tells what
 happened; the work itself is in `relevance` and runs without Prefect too. The shard files, not

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flows.head import leave_link, leave_page, leave_table, retried, say, stage
 from flows.parameters import (
+    Cluster,
     DatasetPath,
     Overrides,
     ParameterError,
@@ -47,16 +47,19 @@ def evaluate(
     preset: Preset = "demo",
     overrides: Overrides | None = None,
     max_workers: Workers | None = None,
+    cluster: Cluster | None = None,
 ) -> str:
     """Evaluate a checkpoint on a dataset's test scenes; returns the path of the report.
 
     Args:
-        dataset: Folder of a labelled dataset.
-        checkpoint: Path of the checkpoint; the dataset's champion when empty, or its newest.
+        dataset: Folder of a labelled dataset, or s3://bucket/prefix.
+        checkpoint: Path or id of the checkpoint; the dataset's champion when empty, or its newest.
         preset: How much is rerun: smoke, demo, laptop or paper.
         overrides: Settings that differ from the preset, e.g. {"tasks": 100}; keys may be dotted.
         max_workers: Processes that work at a time; the number of cores when empty. Times are of
             one core each; for the steadiest ones take 1.
+        cluster: Address of a Dask scheduler whose workers rerun the shards instead, each of which
+            reaches the dataset (and Prefect's server).
     """
     from relevance.evaluation import EvaluationConfig, load_scorer, speed_table
     from relevance.store import Dataset
@@ -65,7 +68,7 @@ def evaluate(
     root = absolute(dataset)
     there = Dataset.open(root)
     config = configured(EvaluationConfig, preset, overrides)
-    path = find_checkpoint(root, absolute(checkpoint) if checkpoint else None)
+    path = absolute(find_checkpoint(root, checkpoint or None))
     shards = there.shards(config.split)
     if not shards:
         raise ParameterError(f"{root}: no {config.split} scenes, expected `generate` first")
@@ -82,9 +85,11 @@ def evaluate(
             for shard in shards
         },
         stage="evaluate",
+        dataset=root,
         max_workers=max_workers,
+        cluster=cluster,
     )
-    report = Path(report_one(str(root), checkpoint_id))
+    report = absolute(report_one(str(root), checkpoint_id))
     speed = [{k: _short(v) for k, v in row.items()} for row in speed_table(there, checkpoint_id)]
     leave_table("evaluation", speed, f"Guided planning, `{checkpoint_id}`")
     leave_link("report", report, "Report")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-from flows.head import announce, leave_table, retried, say, stage
+from flows.head import leave_table, retried, say, stage
 from flows.parameters import (
     Cluster,
     DatasetPath,
@@ -16,6 +16,7 @@ from flows.parameters import (
     configured,
 )
 from flows.shards import process_pool, run_work
+from flows.telling import announce
 
 if TYPE_CHECKING:
     from relevance.pipeline import Job, ShardReport

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import inspect
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -20,7 +20,6 @@ from prefect.artifacts import (
     create_table_artifact,
 )
 from prefect.cache_policies import NO_CACHE
-from prefect.events import emit_event
 from prefect.exceptions import ParameterTypeError
 from prefect.settings import get_current_settings
 from prefect.task_runners import TaskRunner
@@ -28,8 +27,6 @@ from prefect.task_runners import TaskRunner
 from flows.parameters import ParameterError
 from flows.shards import one_by_one
 from relevance.errors import RelevanceError
-
-EVENT = "shards.written"
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -137,18 +134,3 @@ def leave_page(key: str, markdown: str, description: str) -> None:
 def leave_link(key: str, file: Path, text: str) -> None:
     """A link to a file."""
     create_link_artifact(file.as_uri(), key=key, link_text=text, description=text)
-
-
-def announce(dataset: Path, table: str, written: Iterable[str]) -> None:
-    """Emit `shards.written` with the names of the new shards; nothing when there are none."""
-    names = sorted(written)
-    if names:
-        emit_event(
-            EVENT,
-            resource={
-                "prefect.resource.id": f"relevance.dataset.{dataset}",
-                "prefect.resource.name": dataset.name,
-                "relevance.table": table,
-            },
-            payload={"dataset": str(dataset), "table": table, "shards": len(names)},
-        )

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from typing import TYPE_CHECKING, Any
 
-from flows.head import announce, leave_table, retried, say, stage
+from flows.head import leave_table, retried, say, stage
 from flows.parameters import Cluster, DatasetPath, Overrides, Workers, absolute
 from flows.shards import process_pool, run_work
+from flows.telling import LABELS_SHIFTED, announce, trouble
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from relevance.pipeline import Job, ShardReport
+    from relevance.store import Dataset, Labelling
 
 
 @retried(name="label-shard")
@@ -46,12 +50,13 @@ def label(
     """
     from relevance.pipeline import labels_work
     from relevance.scene import PREDICATES
-    from relevance.store import sql
+    from relevance.store import Dataset, sql
 
     root = absolute(dataset)
     work = labels_work(
         root, predicates=predicates, policy=policy, replan=replan, overrides=overrides
     )
+    before = Dataset.open(root).labelling
     made = run_work(label_one, work, stage="label", max_workers=max_workers, cluster=cluster)
     _, totals = sql(
         root,
@@ -80,6 +85,10 @@ def label(
         if predicate in (predicates or PREDICATES)
     ]
     leave_table("label-shards", rows, f"Plans of `{root}`")
+    shifts = shifted(Dataset.open(root), before, reports, policy) if made.reports else []
+    if shifts:
+        lines = [f"- {line}" for line in shifts]
+        trouble(root, LABELS_SHIFTED, shifts[0], "\n".join(lines), shifts=shifts)
     announce(root, "labels", made.reports)
     say("label: %s", made.summary)
     return {
@@ -89,3 +98,26 @@ def label(
         "tasks": sum(row["tasks"] for row in rows),
         "holds": sum(row["plans that hold"] for row in rows),
     }
+
+
+def shifted(
+    dataset: Dataset,
+    before: Labelling | None,
+    reports: Collection[ShardReport],
+    policy: str | None,
+) -> list[str]:
+    """A line for each predicate whose share of relevant objects shifted with these shards.
+
+    What was planned anew is held against its scenes' plans before, once it has taken their place;
+    else it is held against the other shards.
+    """
+    from relevance.pipeline import balances, balances_between, pending
+
+    if pending(dataset) is not None and policy is None:
+        return []
+    if before is not None and policy is None and dataset.labelling != before:
+        found = balances_between(dataset, before)
+    else:
+        new = [(str(report.predicate), report.spec.split, report.spec.shard) for report in reports]
+        found = balances(dataset, new, policy)
+    return [str(balance) for balance in found if balance.shifted]

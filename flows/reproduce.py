@@ -88,6 +88,7 @@ def reproduce(
             for shard in shards
         },
         stage="score",
+        dataset=root,
         max_workers=max_workers,
     )
     run_shards(
@@ -104,6 +105,7 @@ def reproduce(
             for shard in shards
         },
         stage="rerun",
+        dataset=root,
         max_workers=max_workers,
     )
     page = Path(build_one(str(root), str(absolute(out)) if out else None, given))

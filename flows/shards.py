@@ -14,10 +14,11 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import UUID
 
@@ -29,6 +30,8 @@ from prefect.server.api.server import SubprocessASGIServer
 from prefect.settings import PREFECT_API_URL, get_current_settings, temporary_settings
 from prefect.task_runners import ProcessPoolTaskRunner, TaskRunner, ThreadPoolTaskRunner
 
+from flows.telling import CHECK_FAILED, SHARD_FAILED, trouble
+from relevance.errors import RelevanceError
 from relevance.pipeline import do
 from relevance.workers import ShardsFailed, gather, prepare_worker
 
@@ -121,25 +124,29 @@ def run_shards(
     jobs: Mapping[str, dict[str, Any]],
     *,
     stage: str,
+    dataset: Path,
     done: int = 0,
     max_workers: int | None = None,
     cluster: str | None = None,
 ) -> dict[str, Any]:
     """Run the task once a job (name -> parameters), in any order; results by name.
 
-    `done` shards were finished before and count as progress. See `relevance.workers.gather` for
-    those that fail.
+    `done` shards of the dataset were finished before and count as progress. See
+    `relevance.workers.gather` for those that fail.
     """
     outcomes = functools.partial(
         _outcomes, task=task, parameters=dict, max_workers=max_workers, cluster=cluster
     )
-    with progress(stage, done + len(jobs), done=done) as advance:
+    with (
+        progress(stage, done + len(jobs), done=done) as advance,
+        failures_told(stage, dataset) as warn,
+    ):
         return gather(
             stage,
             jobs,
             outcomes,
             made=lambda made: advance(done + made),
-            warn=get_run_logger().warning,
+            warn=warn,
         )
 
 
@@ -160,12 +167,15 @@ def run_work(
         cluster=cluster,
     )
     total = work.done + len(work.jobs)
-    with progress(stage, total, done=work.done) as advance:
+    with (
+        progress(stage, total, done=work.done) as advance,
+        failures_told(stage, work.root) as warn,
+    ):
         return do(
             work,
             outcomes,
             made=lambda made: advance(work.done + made),
-            warn=get_run_logger().warning,
+            warn=warn,
         )
 
 
@@ -191,6 +201,29 @@ def _outcomes(
             name = flying.pop(future)
             future.wait()
             yield name, future.result(raise_on_failure=False)
+
+
+@contextmanager
+def failures_told(stage: str, dataset: Path) -> Iterator[Callable[[str], None]]:
+    """Yields who takes a line about a failed shard; tells of trouble where the block fails."""
+    lines = list[str]()
+
+    def warn(line: str) -> None:
+        lines.append(line)
+        get_run_logger().warning(line)
+
+    try:
+        yield warn
+    except Exception as error:
+        if lines:
+            trouble(dataset, SHARD_FAILED, str(error), _listed(lines), stage=stage, shards=lines)
+        elif isinstance(error, RelevanceError):  # its shards were made, and are refused
+            trouble(dataset, CHECK_FAILED, str(error), stage=stage)
+        raise
+
+
+def _listed(lines: Iterable[str]) -> str:
+    return "\n".join(f"- {line}" for line in lines)
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flows.head import leave_page, leave_table, retried, say, stage
@@ -48,10 +47,10 @@ def train(
     The same settings on the same data give the same checkpoint, so nothing is trained twice.
 
     Args:
-        dataset: Folder of a labelled dataset.
+        dataset: Folder of a labelled dataset, or s3://bucket/prefix.
         preset: Size and settings: smoke, demo, laptop or paper.
         overrides: Settings that differ from the preset, e.g. {"steps": 2000, "model.body": "vit"}.
-        out: Another folder for the checkpoint than DATASET/checkpoints.
+        out: Another folder for the checkpoint than DATASET/checkpoints, or s3://bucket/prefix.
     """
     from relevance.store import Dataset
     from relevance.training import TrainConfig
@@ -59,7 +58,7 @@ def train(
     root = absolute(dataset)
     there = Dataset.open(root)
     config = configured(TrainConfig, preset, overrides)
-    path = Path(train_model(str(root), config, str(absolute(out)) if out else None))
+    path = absolute(train_model(str(root), config, str(absolute(out)) if out else None))
     tune_guide(str(root), str(path))
     [row] = [r for r in there.read_rows("checkpoints") if r["checkpoint_id"] == path.stem]
     metrics = json.loads(row["metrics"])

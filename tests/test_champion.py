@@ -250,6 +250,20 @@ def test_a_real_trial_counts_bounds_and_no_clock(dataset):
     assert one.change is None
 
 
+@pytest.mark.parametrize(("guide", "stop"), [("order", "first"), ("shortest", "level")])
+def test_no_guide_stops_as_the_guide_does(dataset, monkeypatch, guide, stop):
+    stops = []
+
+    def spent(scene, goal, planner, guide):
+        stops.append((guide is None, planner.stop))
+        return 100, True
+
+    monkeypatch.setattr(champion, "_spent", spent)
+    monkeypatch.setattr(champion, "fresh_tasks", lambda *_: [(0, None), (1, None)])
+    contend(dataset.path, "glimpse", TrialConfig(tasks=2, guide=guide))
+    assert stops == [(False, stop), (True, stop)] * 2
+
+
 def test_the_command_promotes_rolls_back_and_shows(dataset, ids, capsys, ruled):
     root = str(dataset.path)
     ruled({None: 1000, "geometry": 500, "glimpse": 600})
@@ -278,29 +292,6 @@ def test_the_command_promotes_rolls_back_and_shows(dataset, ids, capsys, ruled):
     assert "one of" in run("--promote", ids["glimpse"], "--guide", "prune")[2]
 
 
-def test_it_is_trained_anew_when_enough_is_new(dataset, ids):
-    from flows.retrain import enough
-
-    row = dataset.read_rows("checkpoints", checkpoint_id=ids["glimpse"])[0]
-    settings = row["config_hash"]
-
-    def is_enough(labels, labelling="8/x/found", settings=settings, least=0.1):
-        return enough(dataset, read_record(dataset), settings, (labels, labelling), least)
-
-    assert is_enough(1000), "nobody was tried yet"
-    crown(dataset, ids["geometry"], "")
-    settle(
-        dataset, ids["glimpse"], before=ids["geometry"], promoted=False, why="",
-        learned=(1000, "8/x/found"),
-    )  # fmt: skip
-    assert not is_enough(1000, least=0.0), "nothing is new"
-    assert not is_enough(1100)
-    assert is_enough(1112)
-    assert is_enough(1001, least=0.0)
-    assert is_enough(1000, labelling="9/x/found")
-    assert is_enough(1000, settings="others")
-
-
 def test_the_preset_fits_the_scenes():
     found = [fitting_preset(n) for n in (0, 24, 1299, 1300, 16_999, 17_000, 10**6)]
     assert found == ["smoke", "smoke", "smoke", "demo", "demo", "laptop", "paper"]
@@ -311,5 +302,5 @@ def test_an_object_store_is_refused_before_anything_is_written():
         path = "s3://bucket/d"
 
     refused = pytest.raises(DatasetError, match="an object store has no locks")
-    with refused, champions._alone(There()):
-        pass
+    with refused:
+        champions.refuse_remote(There())

@@ -29,10 +29,12 @@ from relevance.training import (
     Reader,
     TrainConfig,
     checkpoint_id,
+    continued,
     find_checkpoint,
     load_checkpoint,
     measure,
     pick_device,
+    precision,
     save_checkpoint,
     train,
 )
@@ -377,6 +379,42 @@ def test_a_head_that_is_trained_alone_leaves_the_others_as_they_are(root: Path) 
     assert not equal(after, fresh), "the new head learns"
     with pytest.raises(CheckpointError, match=r"has a head for behind, expected new --predicates"):
         train(root, replace(later, predicates=("behind",)))
+
+
+def test_training_goes_on_from_weights_that_fit(root: Path) -> None:
+    first = train(root, replace(CONFIG, steps=2))
+    onward = continued(root, replace(CONFIG, steps=8), first.stem, 0.25)
+    assert (onward.steps, onward.continues) == (2, first.stem)
+    assert onward.content_hash != replace(CONFIG, steps=2).content_hash
+    # Without a learning rate its weights are those that it began with.
+    still = train(root, replace(onward, learning_rate=1e-30))
+    assert equal(weights(still), weights(first))
+    second = train(root, onward)
+    before, after = weights(first), weights(second)
+    moved = [name for name in before if not torch.equal(before[name], after[name])]
+    assert len(moved) > len(before) / 2, "every part learns on"
+    meta = load_checkpoint(second)[1]
+    assert meta["config"]["continues"] == first.stem
+    assert precision(meta["metrics"]) == pytest.approx(
+        np.mean(
+            [
+                of["queries"]["average_precision"]
+                for name, of in meta["metrics"].items()
+                if name in PREDICATES
+            ]
+        )
+    )
+    other = replace(CONFIG, model=replace(CONFIG.model, width=16))
+    for config, message in (
+        (other, "has body glimpse of other settings, expected glimpse with those of this train"),
+        (replace(CONFIG, predicates=("on",)), "has heads for on-the-left, .*, expected on$"),
+    ):
+        with pytest.raises(CheckpointError, match=f"continues: {first.stem} {message}"):
+            continued(root, config, first.stem, 0.5)
+    with pytest.raises(DatasetError, match="unknown checkpoint 'x'"):
+        continued(root, CONFIG, "x", 0.5)
+    with pytest.raises(RelevanceError, match="start a and continues b: expected one"):
+        replace(CONFIG, start="a", continues="b")
 
 
 def test_the_newest_checkpoint_and_how_one_is_named(root: Path, tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from streamlit.testing.v1 import AppTest
 
 from dashboards.asking import SQL, Choice, ask, version_of
 from relevance.evaluation import read_evaluations, read_predictions, settings, summarise
+from relevance.networks import crown, settle
 from relevance.pipeline import describe
 from relevance.report.style import TIMES, percent
 from relevance.store import Dataset
@@ -282,6 +283,23 @@ def test_a_broken_file_gets_a_page_that_says_how_to_mend_it(page, tmp_path, what
     assert not app.exception
     assert file.name in app.error[0].value.replace("\\", "")
     assert "relevance repair" in app.code[-1].value
+
+
+def test_runs_say_which_checkpoint_stands_and_what_became_of_others(page, tmp_path) -> None:
+    root, checkpoint = evaluated()
+    shutil.copytree(root, tmp_path / "d")
+    there = Dataset.open(tmp_path / "d")
+    app = page(there.path, "runs")
+    assert any(f"**{checkpoint.stem}**, the newest" in text.value for text in app.markdown)
+    assert len(app.dataframe) == 1
+    crown(there, checkpoint.stem, "by hand")
+    settle(there, "later", before=checkpoint.stem, promoted=False, why="no less work")
+    app = page(there.path, "runs")
+    assert not app.exception
+    assert any(f"**{checkpoint.stem}**, the champion" in text.value for text in app.markdown)
+    history = app.dataframe[1].value
+    assert [*history["what"]] == ["refused", "promoted"]
+    assert [*history["why"]] == ["no less work", "by hand"]
 
 
 # --- Prefect ----------------------------------------------------------------------------------

@@ -34,14 +34,16 @@ def prefect_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-def _shards(task: Any, jobs: dict[str, dict[str, Any]], workers: int = 1) -> dict[str, Any]:
+def _shards(
+    task: Any, jobs: dict[str, dict[str, Any]], workers: int = 1, dataset: Path = Path("/nowhere")
+) -> dict[str, Any]:
     from prefect import flow
 
     from flows.shards import process_pool, run_shards
 
     @flow(name="shards", task_runner=process_pool(), persist_result=False)
     def run() -> dict[str, Any]:
-        return run_shards(task, jobs, stage="shards", max_workers=workers)
+        return run_shards(task, jobs, stage="shards", dataset=dataset, max_workers=workers)
 
     return run()
 
@@ -92,7 +94,12 @@ def test_a_failing_shard_is_retried_and_does_not_stop_the_others(
     with pytest.raises(
         ShardsFailed, match=r"1 of 4 shards failed, 3 were made; .*OSError: no room"
     ):
-        _shards(_task(_fail), jobs)
+        _shards(_task(_fail), jobs, dataset=tmp_path)
+    [event] = wait_for(lambda: _events("shard.failed", tmp_path), 30, "an event")
+    assert event["resource"]["prefect.resource.id"] == f"relevance.dataset.{tmp_path}"
+    assert event["payload"]["said"].startswith("shards: 1 of 4 shards failed, 3 were made")
+    assert event["payload"]["shards"] == ["shards: shard 1: OSError: no room"]
+    assert "- shards: shard 1: OSError: no room" in _artifacts()["shard-failed"]["data"]
     assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {
         "1": "xx",
         "4": "x",
@@ -132,6 +139,12 @@ def _api(method: str, path: str, **body: Any) -> Any:
 def _artifacts() -> dict[str, dict[str, Any]]:
     found = _api("POST", "/artifacts/filter", sort="CREATED_DESC", limit=200)
     return {item["key"]: item for item in reversed(found) if item["key"]}
+
+
+def _events(name: str, dataset: Path) -> list[dict[str, Any]]:
+    """Those about a dataset; flows of other datasets tell of theirs."""
+    found = _api("POST", "/events/filter", filter={"event": {"name": [name]}})["events"]
+    return [event for event in found if event["payload"]["dataset"] == str(dataset)]
 
 
 @pytest.fixture(scope="module")
@@ -185,13 +198,8 @@ def test_flows_leave_artifacts_and_events(dataset: Path) -> None:
     assert artifacts["generate-progress"]["data"] == 100.0
     assert artifacts["label-progress"]["data"] == 100.0
 
-    def events() -> list[dict[str, Any]]:
-        wanted = {"event": {"name": ["shards.written"]}}
-        return _api("POST", "/events/filter", filter=wanted)["events"]
-
-    # Earlier flows of other datasets may have told of theirs.
     def ours() -> dict[str, Any]:
-        found = [e for e in events() if e["payload"]["dataset"] == str(dataset)]
+        found = _events("shards.written", dataset)
         return {e["resource"]["relevance.table"]: e["payload"]["shards"] for e in found}
 
     wait_for(lambda: len(ours()) == 2, 30, "two events")
@@ -201,12 +209,12 @@ def test_flows_leave_artifacts_and_events(dataset: Path) -> None:
 def test_a_second_run_makes_nothing_and_tells_nobody(
     dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from flows import head
+    from flows import telling
     from flows.generate import generate
     from flows.label import label
 
     told: list[Any] = []
-    monkeypatch.setattr(head, "emit_event", lambda *args, **more: told.append(args))
+    monkeypatch.setattr(telling, "emit_event", lambda *args, **more: told.append(args))
     before = {file: file.stat().st_mtime_ns for file in dataset.rglob("*") if file.is_file()}
     assert generate(dataset=str(dataset), preset="smoke", overrides=FEW)["written"] == 0
     assert label(dataset=str(dataset), predicates=["on"], max_workers=1)["written"] == 0
@@ -263,56 +271,6 @@ def test_parameters_that_cannot_be_are_one_line(prefect_server: None, tmp_path: 
     (tmp_path / "file").touch()
     with pytest.raises(ParameterError, match=r"^dataset: \S+/file is a file, expected the path"):
         generate(dataset=str(tmp_path / "file"), preset="smoke")
-
-
-def test_retrain_trains_evaluates_and_then_rests(dataset: Path) -> None:
-    from flows.retrain import retrain
-    from relevance.networks import read_record
-    from relevance.store import Dataset
-
-    def run() -> dict[str, Any]:
-        return retrain(
-            dataset=str(dataset),
-            preset="smoke",
-            overrides={"steps": 4},
-            evaluation={"tasks": 1},
-            max_workers=1,
-        )
-
-    first = run()
-    assert first["new"]
-    checkpoint, report = Path(first["checkpoint"]), Path(first["report"])
-    assert checkpoint.is_file()
-    assert checkpoint.parent == dataset / "checkpoints"
-    assert "<html" in report.read_text()
-    artifacts = _artifacts()
-    speed = json.loads(artifacts["evaluation"]["data"])
-    assert {row["guide"] for row in speed} >= {"prune", "prune-then-full"}
-    assert all("missed" in row and row["tasks"] > 0 for row in speed)
-    assert report.as_uri() in artifacts["report"]["data"]
-    assert str(report) in artifacts["evaluation-summary"]["data"]
-    metrics = json.loads(artifacts["train-metrics"]["data"])
-    assert "on" in {row["group"] for row in metrics}
-    said = artifacts["champion"]["data"]
-    assert f"{checkpoint.stem}: {'promoted' if first['promoted'] else 'refused'}" in said
-    record = read_record(Dataset.open(dataset))
-    assert record.champion == (checkpoint.stem if first["promoted"] else None)
-    [event] = record.history
-    assert event.why in said
-    assert event.labels == sum(
-        row["split"] == "train" for row in Dataset.open(dataset).read_rows("labels")
-    )
-    changed = checkpoint.stat().st_mtime_ns, report.stat().st_mtime_ns
-    second = run()
-    assert not second["new"]
-    assert second["checkpoint"] == checkpoint.stem
-    assert (checkpoint.stat().st_mtime_ns, report.stat().st_mtime_ns) == changed
-    # While it is being planned anew, what it holds now is not worth learning.
-    there = Dataset.open(dataset)
-    before = there.description
-    there.describe({**before, "next": {"config": before["config"]}})
-    assert run()["checkpoint"] is None
-    there.describe(before)
 
 
 def test_a_server_that_does_not_answer_is_named(

@@ -26,7 +26,7 @@ from relevance.pipeline import (
 )
 from relevance.pipeline.checking import check
 from relevance.store import Dataset, DatasetError, locate, replacing, sql
-from relevance.training import Catalogue, Reader, TrainConfig
+from relevance.training import Catalogue, Reader, TrainConfig, find_checkpoint, train
 
 FEW = {
     "train.same_plane": 0,
@@ -164,6 +164,31 @@ def test_what_is_broken_there_is_named_and_repaired(
     assert hashes(root) == hashes(calm)
 
 
+@pytest.mark.slow  # a server of objects
+def test_a_killed_training_goes_on_there_from_its_state(bucket: str) -> None:
+    root = f"{bucket}/killed"
+    locate(root).fs.put(str(ruled()), root, recursive=True)  # type: ignore[attr-defined]
+    config = replace(TrainConfig.smoke(), steps=5, save_every=2, threads=1, workers=0)
+
+    def stop(done: int, total: int) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(root, config, progress=stop)
+    [state] = locate(f"{root}/checkpoints").iterdir()
+    assert state.suffix == ".state"
+    steps: list[int] = []
+    path = train(root, config, progress=lambda done, total: steps.append(done))
+    assert steps == [3, 4, 5]
+    assert sorted(file.suffix for file in path.parent.iterdir()) == [".parquet", ".pt"]
+    [row] = Dataset.open(root).read_rows("checkpoints")
+    assert find_checkpoint(root, row["checkpoint_id"]) == path
+    # A folder here may hold what was learned there, and the other way about.
+    elsewhere = train(root, replace(config, seed=1), out=f"{bucket}/models")
+    assert str(find_checkpoint(root, elsewhere.stem)) == f"{bucket}/models/{elsewhere.name}"
+
+
 def test_an_object_appears_whole_or_not_at_all(bucket: str) -> None:
     path = locate(f"{bucket}/atomic/file.bin")
 
@@ -219,8 +244,10 @@ from dask.distributed import LocalCluster
 
 if __name__ == "__main__":
     root, overrides = sys.argv[1], eval(sys.argv[2])
+    from flows.evaluate import evaluate
     from flows.generate import generate
     from flows.label import label
+    from flows.train import train
     with LocalCluster(
         n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
     ) as cluster:
@@ -229,6 +256,12 @@ if __name__ == "__main__":
         )
         labelled = label(dataset=root, cluster=cluster.scheduler_address)
         again = label(dataset=root, cluster=cluster.scheduler_address)
+        checkpoint = train(dataset=root, preset="smoke", overrides={"steps": 2})
+        report = evaluate(
+            dataset=root, preset="smoke", overrides={"tasks": 1}, cluster=cluster.scheduler_address
+        )
+    print("trained", checkpoint)
+    print("report", report)
     print("made", made["written"], labelled["written"], again["written"])
 """
 
@@ -251,5 +284,15 @@ def test_the_flows_on_a_dask_cluster(where: str, bucket: str, calm: Path, tmp_pa
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert "made 3 3 0" in done.stdout
-    assert hashes(root) == hashes(calm)
+    found, expected = hashes(root), hashes(calm)
+    assert {name: found.get(name) for name in expected} == expected
     assert check(root) == []
+    there = Dataset.open(root)
+    [row] = there.read_rows("checkpoints")
+    assert row["path"] == f"checkpoints/{row['checkpoint_id']}.pt"
+    assert f"trained {root}/{row['path']}\n" in done.stdout
+    assert f"report {root}/report.html\n" in done.stdout
+    assert "<html" in locate(f"{root}/report.html").read_text()
+    assert find_checkpoint(root) == locate(f"{root}/{row['path']}")
+    assert len(there.read_rows("evaluations")) > 0
+    assert train(root, replace(TrainConfig.smoke(), steps=2)) == find_checkpoint(root), "once"

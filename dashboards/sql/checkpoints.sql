@@ -5,6 +5,7 @@ rerun AS (SELECT checkpoint_id, count(*) AS reruns FROM evaluations GROUP BY che
 SELECT
     c.checkpoint_id, c.body, c.preset, c.seed, c.created, c.train_seconds, c.path,
     coalesce(c.config ->> 'policy', 'found') AS policy,
+    nullif(c.config ->> 'continues', '') AS continues,
     coalesce(predictions, 0) AS predictions, coalesce(reruns, 0) AS reruns
 FROM checkpoints AS c
 LEFT JOIN predicted USING (checkpoint_id)

@@ -1,5 +1,6 @@
 """What ran: flow runs from Prefect's server, and the checkpoints that came of them."""
 
+from datetime import datetime
 from pathlib import Path
 
 import streamlit as st
@@ -7,6 +8,7 @@ import streamlit as st
 from dashboards.asking import ask, chosen
 from dashboards.prefect_api import NoAnswer, artifacts, flow_runs, server
 from dashboards.showing import command, figures, lacking, plain
+from relevance.networks import read_record
 
 GOOD, BAD = ("Completed",), ("Failed", "Crashed", "TimedOut")
 
@@ -18,10 +20,13 @@ def checkpoints() -> None:
     if not rows:
         lacking("Nothing was trained on this dataset yet:", f"relevance train {choice.path}")
         return
-    newest = rows[0]
+    record = read_record(choice.dataset)
+    meant, what = rows[0]["checkpoint_id"], "newest"
+    if record.champion:
+        meant, what = record.champion, "champion"
     st.markdown(
-        f"**{plain(newest['checkpoint_id'])}**, the newest: evaluations, reports and the flows "
-        "take it unless another is named."
+        f"**{plain(meant)}**, the {what}: evaluations, reports and flows take it unless another "
+        "is named."
     )
     st.dataframe(
         [
@@ -31,6 +36,7 @@ def checkpoints() -> None:
                 "minutes": row["train_seconds"] / 60,
                 "body": row["body"],
                 "preset": row["preset"],
+                "trained on from": row["continues"],
                 "label policy": row["policy"],
                 "scored objects": row["predictions"],
                 "reruns": row["reruns"],
@@ -43,6 +49,27 @@ def checkpoints() -> None:
             "minutes": st.column_config.NumberColumn(format="%.1f"),
         },
     )
+    if record.history:
+        st.subheader("What became of those that were tried", anchor=False)
+        last = record.history[-1]
+        st.write(f"The last, {plain(last.checkpoint_id)}, was {last.what}: {plain(last.why)}.")
+        st.dataframe(
+            [
+                {
+                    "at (UTC)": datetime.fromisoformat(event.at),
+                    "what": event.what,
+                    "checkpoint": event.checkpoint_id,
+                    "champion before": event.before,
+                    "why": event.why,
+                }
+                for event in reversed(record.history)
+            ],
+            hide_index=True,
+            column_config={
+                "at (UTC)": st.column_config.DatetimeColumn(format="YYYY-MM-DD HH:mm"),
+                "why": st.column_config.TextColumn(width="large"),
+            },
+        )
 
 
 def runs(url: str) -> None:

@@ -8,14 +8,15 @@ Two figures, both paired, with a bootstrap interval (metrics.py) at `confidence`
   summed over those that either solves: it must shrink beyond noise (the ratio's interval must
   lie under 1). A guide that loses no task is asked for, so a miss costs what the fallback does.
 
-Without a champion the contender is held against no guide, which keeps every object: only the work
-counts then.
+Without a champion the contender is held against no guide, which keeps every object and stops as the
+guide does (a guide whose first plan counts against a search of which the first plan counts): only
+the work counts then.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -31,7 +32,7 @@ from relevance.evaluation.predictions import (
 )
 from relevance.evaluation.scorer import EvaluationError, NetworkScorer, load_scorer
 from relevance.metrics import Interval, bootstrap, ratio_of_sums
-from relevance.networks import find_checkpoint, read_record, settle
+from relevance.networks import Learned, find_checkpoint, read_record, settle
 from relevance.pipeline import load_config
 from relevance.planner import GUIDES, Guide, PlannerConfig, plan
 from relevance.sampling import SAMPLER_VERSION, SceneConfig, sample_task
@@ -140,11 +141,11 @@ def contend(
     checkpoint: str | Path,
     config: TrialConfig | None = None,
     *,
-    learned: tuple[int, str] = (0, ""),
+    learned: Learned | None = None,
     progress: Progress | None = None,
 ) -> Trial | None:
     """Try a checkpoint against the champion and promote or refuse it, which the record keeps with
-    what it `learned` from (see `Event`).
+    what it `learned` from.
 
     Where another was promoted meanwhile, it is tried against that one. None where it is the
     champion itself.
@@ -181,6 +182,8 @@ def _trial(
             lacking=lacking,
         )  # fmt: skip
     planner = load_config(_first(dataset)).planner
+    if GUIDES[config.guide].first:  # then no guide, too, is done with its first plan
+        planner = replace(planner, stop="first")
     guides = [
         scorer and Guide(scorer=scorer, mode=config.guide) for scorer in (contender, champion)
     ]

@@ -1,7 +1,7 @@
 """Layers that more than one body is made of.
 
 Shape suffixes: B scenes, N objects (padded), G goals, T trios, L tokens, D width,
-C channels or columns, R rows.
+C channels or columns, R rows, H heads.
 """
 
 from __future__ import annotations

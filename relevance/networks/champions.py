@@ -21,11 +21,23 @@ from pydantic import TypeAdapter, ValidationError
 
 from relevance.configs import first_error
 from relevance.networks.files import named, shipped
-from relevance.store import Dataset, DatasetError, is_remote, replacing
+from relevance.store import Dataset, DatasetError, is_remote, locate, replacing
 
 CHAMPION = "champion"
 """The name by which the champion of a dataset is asked for."""
 _FILE = "champion.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Learned:
+    """What a contender learned from, as far as it says when the next one is due."""
+
+    labels: int = 0
+    """Training labels that there were when it began; 0 where nobody counted."""
+    labelling: str = ""
+    """How they were made."""
+    settings: str = ""
+    """Hash of the settings of training that were asked for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,10 +51,7 @@ class Event:
     """The champion that stood then; None for none."""
     at: str
     """When, UTC, ISO 8601."""
-    labels: int = 0
-    """Training labels that there were when it began to learn; 0 where nobody counted."""
-    labelling: str = ""
-    """How they were made."""
+    learned: Learned = Learned()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,10 +99,10 @@ def settle(
     before: str | None,
     promoted: bool,
     why: str,
-    learned: tuple[int, str] = (0, ""),
+    learned: Learned | None = None,
 ) -> bool:
     """Enter what became of a contender; False, and nothing entered, where another champion than
-    `before` stands by now. learned: the labels and labelling of its event."""
+    `before` stands by now."""
 
     def change(record: Record) -> Record | None:
         if record.champion != before:
@@ -147,7 +156,7 @@ def _entered(
     what: Any,
     why: str,
     before: str | None,
-    learned: tuple[int, str] = (0, ""),
+    learned: Learned | None = None,
 ) -> Record:
     event = Event(
         checkpoint_id=checkpoint_id,
@@ -155,14 +164,14 @@ def _entered(
         why=why,
         before=before,
         at=datetime.now(UTC).isoformat(timespec="seconds"),
-        labels=learned[0],
-        labelling=learned[1],
+        learned=learned or Learned(),
     )
     return replace(record, history=(*record.history, event))
 
 
 def _change(dataset: Dataset, change: Callable[[Record], Record | None]) -> bool:
     """Replace the record by what is made of it, unless that is None; whether it was."""
+    refuse_remote(dataset)
     with _alone(dataset):
         record = change(read_record(dataset))
         if record is None:
@@ -173,13 +182,17 @@ def _change(dataset: Dataset, change: Callable[[Record], Record | None]) -> bool
         return True
 
 
-@contextmanager
-def _alone(dataset: Dataset) -> Iterator[None]:
-    """One writer at a time: a lock on the folder itself, which ends with its process."""
+def refuse_remote(dataset: Dataset) -> None:
+    """Raise DatasetError where no champion can be made."""
     if is_remote(dataset.path):
         raise DatasetError(
             f"{dataset.path}: champions need a local folder, an object store has no locks"
         )
+
+
+@contextmanager
+def _alone(dataset: Dataset) -> Iterator[None]:
+    """One writer at a time: a lock on the folder itself, which ends with its process."""
     folder = os.open(dataset.path, os.O_RDONLY)
     try:
         fcntl.flock(folder, fcntl.LOCK_EX)
@@ -222,7 +235,8 @@ def find_checkpoint(root: str | Path, text: str | Path | None = None) -> Path:
     if name is None:
         raise DatasetError(f"{dataset.path}: no champion yet, expected one of {known}")
     if name in rows:
-        return dataset.path / rows[name]["path"]
+        file = locate(rows[name]["path"])
+        return file if is_remote(file) or file.is_absolute() else dataset.path / file
     path = named(name)
     if path.is_file():
         return path

@@ -18,6 +18,7 @@ from relevance.pipeline.settings import (
     shard_specs,
     shards_of,
 )
+from relevance.pipeline.shifting import Balance, balances, balances_between
 from relevance.pipeline.upkeep import REFUSED_LEAST, REFUSED_SHARE, finish, integrity
 from relevance.pipeline.work import (
     Job,
@@ -33,6 +34,7 @@ __all__ = [
     "LAYOUT",
     "REFUSED_LEAST",
     "REFUSED_SHARE",
+    "Balance",
     "Counts",
     "DatasetConfig",
     "Estimate",
@@ -46,6 +48,8 @@ __all__ = [
     "Work",
     "actual",
     "append",
+    "balances",
+    "balances_between",
     "beyond_repair",
     "describe",
     "do",

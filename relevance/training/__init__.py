@@ -40,7 +40,14 @@ from relevance.training.shipping import ship
 from relevance.training.speed import Speed, measure_speed
 from relevance.training.studies import RECIPES, STUDIES, Run, Study
 from relevance.training.studying import Plan, run_study
-from relevance.training.trainer import Trainer, measure, train, use_bfloat16
+from relevance.training.trainer import (
+    Trainer,
+    continued,
+    measure,
+    precision,
+    train,
+    use_bfloat16,
+)
 
 __all__ = [
     "CHECKPOINT_VERSION",
@@ -67,6 +74,7 @@ __all__ = [
     "batch_of",
     "checkpoint_id",
     "compare_looks",
+    "continued",
     "find_checkpoint",
     "graphs_of",
     "load_checkpoint",
@@ -75,6 +83,7 @@ __all__ = [
     "one_core",
     "pick_device",
     "polling",
+    "precision",
     "relevance_loss",
     "run_study",
     "save_checkpoint",

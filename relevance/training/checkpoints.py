@@ -38,7 +38,7 @@ from relevance.networks import (
     write_checkpoint,
 )
 from relevance.scene import PREDICATES
-from relevance.store import Dataset
+from relevance.store import Dataset, is_remote
 from relevance.training.settings import TrainConfig
 
 STATE_VERSION = 3
@@ -192,7 +192,6 @@ def write_row(dataset: Dataset, path: Path, meta: Mapping[str, Any]) -> None:
     """The checkpoint's row in `checkpoints`; nothing to do when it is there."""
     if dataset.has("checkpoints", name=meta["checkpoint_id"]):
         return
-    inside = path.resolve().is_relative_to(dataset.path.resolve())
     row = {
         "checkpoint_id": meta["checkpoint_id"],
         "body": meta["config"]["model"]["body"],
@@ -200,7 +199,7 @@ def write_row(dataset: Dataset, path: Path, meta: Mapping[str, Any]) -> None:
         "seed": meta["config"]["seed"],
         "dataset_hash": meta["dataset_hash"],
         "created": datetime.fromisoformat(meta["created"]).replace(tzinfo=None),
-        "path": os.path.relpath(path, dataset.path) if inside else str(path.resolve()),
+        "path": _told(dataset, path),
         "train_seconds": meta["train_seconds"],
         "metrics": json.dumps(meta["metrics"], sort_keys=True),
         "config": json.dumps(meta["config"], sort_keys=True),
@@ -208,3 +207,13 @@ def write_row(dataset: Dataset, path: Path, meta: Mapping[str, Any]) -> None:
         "offsets": json.dumps(meta.get("offsets", {}), sort_keys=True),
     }
     dataset.write_rows("checkpoints", [row], name=meta["checkpoint_id"])
+
+
+def _told(dataset: Dataset, path: Path) -> str:
+    """Where a checkpoint lies: within the dataset, if it does, else anywhere."""
+    if is_remote(path):
+        return str(path).removeprefix(f"{dataset.path}/")
+    whole = path.resolve()
+    if not is_remote(dataset.path) and whole.is_relative_to(dataset.path.resolve()):
+        return os.path.relpath(path, dataset.path)
+    return str(whole)

@@ -56,6 +56,9 @@ class TrainConfig:
     start: str = ""
     """Id of a checkpoint of the dataset whose weights are taken over and stay as they are: only
     heads that it lacks are trained, those of `predicates`."""
+    continues: str = ""
+    """Id of a checkpoint of the dataset, of the same body and heads, whose weights training goes
+    on from."""
     polling: Literal["turns", "rounds", "one-by-one"] = "turns"
     """turns: one predicate's batch a step, in rotation; rounds: a batch of each in every step;
     one-by-one: each predicate for its share of the steps, the next begins when it is done."""
@@ -117,6 +120,8 @@ class TrainConfig:
     def _tied(self) -> Self:
         if self.soft_labels and self.policy != "found":
             raise ValueError(f"soft_labels are of policy found, expected it, got {self.policy}")
+        if self.start and self.continues:
+            raise ValueError(f"start {self.start} and continues {self.continues}: expected one")
         return self
 
     @classmethod

@@ -83,12 +83,13 @@ class Trainer:
         self.device = ranks.device(pick_device(config.device))
         # Weights are drawn before they move: equal ones on every device.
         learned = trained_predicates(predicates, config)
-        known = start.predicates if start else ()
+        known = start.predicates if start and not config.continues else ()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.model = RelevanceModel(config.model, (*known, *learned))
         if start:
             self.model.load_state_dict({**self.model.state_dict(), **start.state_dict()})
+        if known:
             for name, weight in self.model.named_parameters():
                 # What belongs to a predicate alone has its name in its own.
                 weight.requires_grad_(not set(learned).isdisjoint(name.split(".")))
@@ -245,7 +246,7 @@ def train(
     catalogue = Catalogue.of(dataset, "train", config)
     _check(dataset, catalogue, config)
     start, before = _start(dataset, config, catalogue)
-    own = replace(config, model=start.config) if start else config
+    own = replace(config, model=start.config) if config.start and start else config
     run = _Run(folder=folder, settings=f"{own.model.body}-{config.content_hash}", data=data)
     with on_threads(config.threads), together() as ranks:
         trainer = Trainer(own, catalogue.predicates, start, ranks)
@@ -357,21 +358,56 @@ def _check(dataset: Dataset, catalogue: Catalogue, config: TrainConfig) -> None:
 def _start(
     dataset: Dataset, config: TrainConfig, catalogue: Catalogue
 ) -> tuple[RelevanceModel | None, dict[str, float]]:
-    """The model whose weights stay, and its offsets, which stay too.
+    """The model whose weights are taken over, and those of its offsets that stay.
 
-    Raises CheckpointError where nothing new would be learned.
+    Raises CheckpointError where they do not fit, or nothing new would be learned.
     """
+    if config.continues:
+        return _taken_over(dataset, config, catalogue), {}
     if not config.start:
         return None, {}
-    model, meta = load_checkpoint(find_checkpoint(dataset.path, config.start))
-    if meta["checkpoint_id"] != config.start:
-        raise CheckpointError(f"start: {config.start} is no id, it holds {meta['checkpoint_id']}")
+    model, meta = _named(dataset, "start", config.start)
     there = set(trained_predicates(catalogue.predicates, config)) & set(model.predicates)
     if there:
         raise CheckpointError(
             f"start: {config.start} has a head for {min(there)}, expected new --predicates"
         )
     return model, meta.get("offsets", {})
+
+
+def _taken_over(dataset: Dataset, config: TrainConfig, catalogue: Catalogue) -> RelevanceModel:
+    name = config.continues
+    model, _ = _named(dataset, "continues", name)
+    if model.config != config.model:
+        raise CheckpointError(
+            f"continues: {name} has body {model.config.body} of other settings, expected "
+            f"{config.model.body} with those of this training"
+        )
+    learned = trained_predicates(catalogue.predicates, config)
+    if set(learned) != set(model.predicates):
+        raise CheckpointError(
+            f"continues: {name} has heads for {', '.join(model.predicates)}, expected "
+            f"{', '.join(learned)}"
+        )
+    return model
+
+
+def _named(dataset: Dataset, what: str, name: str) -> tuple[RelevanceModel, dict[str, Any]]:
+    model, meta = load_checkpoint(find_checkpoint(dataset.path, name))
+    if meta["checkpoint_id"] != name:
+        raise CheckpointError(f"{what}: {name} is no id, it holds {meta['checkpoint_id']}")
+    return model, meta
+
+
+def continued(root: str | Path, config: TrainConfig, checkpoint: str, share: float) -> TrainConfig:
+    """These settings, going on from the weights of a checkpoint for a share of the steps.
+
+    Raises RelevanceError where they do not fit.
+    """
+    config = replace(config, continues=checkpoint, steps=max(1, round(share * config.steps)))
+    dataset = Dataset.open(root)
+    _taken_over(dataset, config, Catalogue.of(dataset, "train", config))
+    return config
 
 
 def reader_for(catalogue: Catalogue, trainer: Trainer) -> Reader:
@@ -403,6 +439,16 @@ def on_threads(count: int) -> Iterator[None]:
 
 
 # --- metrics ------------------------------------------------------------------------------
+
+
+def precision(metrics: Mapping[str, Any]) -> float:
+    """One figure of what `measure` found, to choose among runs by: average precision, which asks
+    for the order of scores alone, averaged over predicates; nan where nothing was measured."""
+    found = [
+        metrics[name]["queries"]["average_precision"] for name in PREDICATES if name in metrics
+    ]
+    known = [value for value in found if value is not None]
+    return float(np.mean(known)) if known else math.nan
 
 
 def measure(
