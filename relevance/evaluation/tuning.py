@@ -139,8 +139,10 @@ def tune_once(
     root: str | Path, checkpoint: str | Path, *, progress: Progress | None = None
 ) -> None:
     """`tune`, where nobody did and there are tasks to choose on."""
-    tuned = "patience" in read_checkpoint(named(checkpoint)).meta
-    if not tuned and Dataset.open(root).shards("validation"):
+    meta = read_checkpoint(named(checkpoint)).meta
+    if "patience" not in meta and choose_tasks(
+        Dataset.open(root), split="validation", per_predicate=1, predicates=meta["predicates"]
+    ):
         tune(root, checkpoint, progress=progress)
 
 
