@@ -85,6 +85,7 @@ def test_results_come_by_name_and_a_dead_worker_costs_a_new_pool(
     assert (tmp_path / "3").exists()
 
 
+@pytest.mark.slow  # a server of its own, and waits between tries
 def test_a_failing_shard_is_retried_and_does_not_stop_the_others(
     prefect_server: None, tmp_path: Path
 ) -> None:
@@ -245,6 +246,7 @@ def test_flows_refuse_what_is_not_there(prefect_server: None, tmp_path: Path) ->
         label(dataset=str(tmp_path), predicates=["above"])
 
 
+@pytest.mark.slow  # a pool of processes plans anew
 def test_another_policy_is_a_parameter(dataset: Path) -> None:
     from flows.label import label
     from relevance.store import Dataset
@@ -355,6 +357,7 @@ def test_a_killed_flow_leaves_nobody_behind_and_resumes_to_the_same_bytes(
     assert {file: file.stat().st_mtime_ns for file in before} == before
 
 
+@pytest.mark.slow  # a server starts and ends
 def test_a_flow_ends_with_its_server(home: Path) -> None:
     program = (
         "import os, signal\n"

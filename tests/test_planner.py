@@ -242,8 +242,8 @@ def grid_agreement(count: int, seed: int) -> tuple[int, int, int]:
 
 
 def test_solves_what_a_brute_force_grid_finds():
-    solvable, solved, held = grid_agreement(30, seed=21)
-    assert solvable >= 20
+    solvable, solved, held = grid_agreement(12, seed=21)
+    assert solvable >= 8
     assert solved >= 0.9 * solvable
     assert held == solved
 

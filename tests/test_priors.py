@@ -9,7 +9,8 @@ import pytest
 
 from relevance.errors import RelevanceError
 from relevance.evaluation import PRIORS, TRUE, Believing, NetworkScorer, Prior, prior_scorer
-from relevance.planner import PATIENCE, Guide, plan
+from relevance.networks import read_checkpoint, shipped
+from relevance.planner import Guide, plan
 from relevance.scene import Goal, Scene
 from tests.planning import BLUE, GREEN, GREY, RED, box, tasks
 
@@ -88,7 +89,7 @@ def test_checkpoints_are_priors_by_their_names():
     geometry = prior_scorer("geometry")
     assert isinstance(geometry, NetworkScorer)
     assert set(geometry.scores(ROW, GOAL)) == set(ROW.names)
-    assert geometry.patience == PATIENCE
+    assert geometry.patience == read_checkpoint(shipped()["geometry"]).meta["patience"]
     assert prior_scorer("swept").patience == 0  # asking costs nothing
     with pytest.raises(RelevanceError, match="unknown prior 'tru', expected one of true, all"):
         prior_scorer("tru")

@@ -16,6 +16,8 @@ from relevance.networks import Learned, crown, read_record, settle
 from relevance.store import Dataset
 from relevance.training import TrainConfig
 
+pytestmark = pytest.mark.slow  # a server, and trainings within flows
+
 HASTE = {"steps": 4, "threads": 1}
 
 
