@@ -109,6 +109,7 @@ def test_a_failing_shard_is_retried_and_does_not_stop_the_others(
     }
 
 
+@pytest.mark.slow  # flows of a server of its own
 def test_bad_input_is_not_retried(prefect_server: None, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="bad input"):
         _shards(_task(_fail), {"2": {"value": 2, "folder": str(tmp_path)}})
