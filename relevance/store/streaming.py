@@ -7,6 +7,7 @@ each of them goes through the same undecoded samples, which is cheap, and finish
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import islice
 from typing import Any, TypeVar, cast
@@ -70,7 +71,19 @@ def polled(
     )
     # Forked, workers have all that is here; what is not safe in a fork they open anew.
     how: dict[str, Any] = {"multiprocessing_context": "fork"} if workers else {}
-    for found in WebLoader(pipeline, batch_size=None, num_workers=workers, **how):
+    loader = iter(WebLoader(pipeline, batch_size=None, num_workers=workers, **how))
+    for found in _taken_ahead(loader) if workers else loader:
         if isinstance(found, RelevanceError):
             raise found
         yield found
+
+
+def _taken_ahead(source: Iterator[Any]) -> Iterator[Any]:
+    """The same, each taken from its process by a thread while the one before is in use."""
+    end = object()
+    found = next(source, end)  # here: processes fork, which they had better not do in a thread
+    with ThreadPoolExecutor(1, "ahead") as thread:
+        while found is not end:
+            following = thread.submit(next, source, end)
+            yield found
+            found = following.result()
