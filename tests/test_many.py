@@ -141,7 +141,7 @@ def test_a_trainer_reads_there_what_it_reads_here(bucket: str, workers: int) -> 
         assert a.names == b.names
         assert (a.image == b.image).all()
         for (p, *mine), (q, *its) in zip(a.turns, b.turns, strict=True):
-            assert p is q
+            assert p == q
             assert all((x == y).all() for x, y in zip(mine, its, strict=True))
 
 
