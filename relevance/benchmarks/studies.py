@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from relevance.benchmarks.runs import Measured, Plot
-from relevance.evaluation import JUDGES, NETWORK, RULE, Predictions, read_predictions
+from relevance.evaluation import JUDGES, NETWORK, NEVER, RULE, Predictions, read_predictions
 from relevance.metrics import (
     WIDE,
     Accuracy,
@@ -29,7 +29,6 @@ from relevance.report.tables import Table
 from relevance.scene import PREDICATES
 from relevance.store import Dataset
 
-NEVER = "always irrelevant"
 EVERY, CLEAR = "all goals", "goals with one answer"
 """Which goals are judged; the second leaves the ambiguous ones out."""
 STANDS = ("on the subject", "on the reference", "elsewhere")

@@ -251,7 +251,7 @@ def train(
     with on_threads(config.threads), together() as ranks:
         trainer = Trainer(own, catalogue.predicates, start, ranks)
         run.resume(trainer)
-        validation = Catalogue.of(dataset, "validation", config)
+        validation, validated = Catalogue.of(dataset, "validation", config), _validated(config)
         with closing(reader_for(catalogue, trainer).steps(trainer.done)) as steps:
             while trainer.done < config.steps:
                 try:
@@ -261,7 +261,7 @@ def train(
                     raise
                 if progress and ranks.first:
                     progress(trainer.done, config.steps)
-                if ranks.first and trainer.done in _validated(config):
+                if ranks.first and trainer.done in validated:
                     _validate(trainer, validation)
                 if trainer.done % config.save_every == 0 and trainer.done < config.steps:
                     run.save(trainer)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -165,21 +165,17 @@ def _data_notes(dataset: Dataset, ours: Sequence[Sequence[int]]) -> list[str]:
 
 def accuracies(evidence: Evidence) -> Sheet:
     """Table II, first half: how often the ViT and our best are right about a query."""
-    rows: list[dict[str, Any]] = []
-    for group, whose, model in _lines(evidence):
-        row: dict[str, Any] = {"group": group, "by": whose}
-        if whose == PAPER:
-            base = 1 - paper().test[group].share
-            row |= {"whose": PAPER, "base_rate": base}
-            row |= share_cells(TRIPLE, paper().accuracy[group])
-        elif model is None:
-            row |= _none()
-        elif len(part := evidence.queries(model, group)):
-            rule = Accuracy.of(JUDGES[RULE](part), part.relevant).total
-            row |= {"whose": OURS, "checkpoint": model.name, "rule": rule, **_judged(part)}
-        else:
-            row |= {"whose": MISSING, "checkpoint": model.name, "why": _unscored(model)}
-        rows.append(row)
+
+    def theirs(group: str) -> dict[str, Any]:
+        base = 1 - paper().test[group].share
+        return {"base_rate": base, **share_cells(TRIPLE, paper().accuracy[group])}
+
+    def ours(model: Model, group: str) -> dict[str, Any]:
+        if not len(part := evidence.queries(model, group)):
+            return {"whose": MISSING, "why": _unscored(model)}
+        rule = Accuracy.of(JUDGES[RULE](part), part.relevant).total
+        return {"whose": OURS, "rule": rule, **_judged(part)}
+
     return Sheet(
         name="table-2-accuracy",
         title="Table II: accuracy",
@@ -194,7 +190,7 @@ def accuracies(evidence: Evidence) -> Sheet:
             shares("always irrelevant", "base_rate"),
             triple("as trained", "trained_"),
         ),
-        rows=tuple(rows),
+        rows=_beside(evidence, theirs, ours),
         notes=(
             *paper().notes["accuracy"],
             "Ours: test queries at beta = 0, the decision that validation chose: the checkpoint's "
@@ -210,18 +206,13 @@ def accuracies(evidence: Evidence) -> Sheet:
 
 def planning_times(evidence: Evidence) -> Sheet:
     """Table II, second half: mean planning time without and with the network."""
-    rows: list[dict[str, Any]] = []
-    for group, whose, model in _lines(evidence):
-        row: dict[str, Any] = {"group": group, "by": whose}
-        if whose == PAPER:
-            row |= {"whose": PAPER, **_theirs(group)}
-        elif model is None:
-            row |= _none()
-        elif rerun := evidence.reruns(model, 0.0, group):
-            row |= {"whose": OURS, "checkpoint": model.name, **time_saved(rerun)}
-        else:
-            row |= {"whose": MISSING, "checkpoint": model.name, "why": _idle(model)}
-        rows.append(row)
+
+    def ours(model: Model, group: str) -> dict[str, Any]:
+        if rerun := evidence.reruns(model, 0.0, group):
+            return {"whose": OURS, **time_saved(rerun)}
+        return {"whose": MISSING, "why": _idle(model)}
+
+    rows = _beside(evidence, _theirs, ours)
     return Sheet(
         name="table-2-time",
         title="Table II: planning time",
@@ -237,7 +228,7 @@ def planning_times(evidence: Evidence) -> Sheet:
             counts("missed", "missed"),
             saved("misses counted", "saved_counted"),
         ),
-        rows=tuple(rows),
+        rows=rows,
         notes=(
             *paper().notes["times"],
             f"Ours: guide {GUIDE}, search {SEARCH}, beta = 0; CPU time of one core of this "
@@ -251,6 +242,24 @@ def planning_times(evidence: Evidence) -> Sheet:
             *_too_quick(rows),
         ),
     )
+
+
+def _beside(
+    evidence: Evidence,
+    theirs: Callable[[str], dict[str, Any]],
+    ours: Callable[[Model, str], dict[str, Any]],
+) -> tuple[dict[str, Any], ...]:
+    """The rows of Table II: of each group the paper's, then those of our models."""
+    rows: list[dict[str, Any]] = []
+    for group, whose, model in _lines(evidence):
+        if whose == PAPER:
+            found = {"whose": PAPER, **theirs(group)}
+        elif model is None:
+            found = _none()
+        else:
+            found = {"checkpoint": model.name, **ours(model, group)}
+        rows.append({"group": group, "by": whose, **found})
+    return tuple(rows)
 
 
 def _lines(evidence: Evidence) -> Iterator[tuple[str, str, Model | None]]:
