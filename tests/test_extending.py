@@ -74,7 +74,7 @@ class MeanBody(Body):
         self.embed = nn.Linear(3, config.width)
         self.heads = nn.ModuleDict({name: nn.Linear(config.width, 1) for name in predicates})
 
-    def encode(self, image, views, present, poses):
+    def encode(self, image, views, present):
         return Encoding(tokens=self.embed(views.mean(dim=(-2, -1))), present=present)
 
     def decode(self, encoding, predicate, goals, asked):

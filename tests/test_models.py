@@ -406,11 +406,7 @@ def test_a_body_is_registered_from_outside() -> None:
             self.heads = torch.nn.ModuleDict({n: torch.nn.Linear(3, 1) for n in predicates})
 
         def encode(
-            self,
-            image: torch.Tensor,
-            views: torch.Tensor,
-            present: torch.Tensor,
-            poses: torch.Tensor | None,
+            self, image: torch.Tensor, views: torch.Tensor, present: torch.Tensor
         ) -> Encoding:
             return Encoding(tokens=views.mean((-1, -2)), present=present)
 

@@ -10,6 +10,7 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,7 @@ from relevance.training import (
     train,
 )
 from relevance.training.examples import in_the_mirror
+from relevance.training.reading import ALIKE
 
 torch.set_num_threads(1)  # threads that wait for each other crawl on a busy machine
 
@@ -144,7 +146,7 @@ def test_a_predicate_without_labels_is_left_out(root: Path) -> None:
 @pytest.mark.parametrize("ranks", [1, 2, 3])
 def test_every_scene_comes_before_any_comes_again(made: Path, ranks: int) -> None:
     """No process loses or repeats one: together they have what one alone has, in its order."""
-    config = replace(PLAIN, scenes_per_batch=3, steps=40)
+    config = replace(PLAIN, scenes_per_batch=3, steps=8 * ALIKE)
     every = [list(reader(made, config, rank=r, ranks=ranks).steps()) for r in range(ranks)]
     for first, group in ((0, SAME_PLANE), (1, (ON,))):
         own = {e.name for e in examples(made) if set(group) & set(e.answers)}
@@ -155,10 +157,24 @@ def test_every_scene_comes_before_any_comes_again(made: Path, ranks: int) -> Non
         ]
         alone = [n for [b] in list(reader(made, config).steps())[first::2] for n in b.names]
         assert shown == alone
-        epochs = np.array(shown[: len(shown) // len(own) * len(own)]).reshape(-1, len(own))
-        assert len(epochs) > 4
-        assert all(Counter(epoch) == Counter(own) for epoch in epochs.tolist())
-        assert (epochs[0] != epochs[1]).any(), "each epoch has an order of its own"
+        windows = [shown[i : i + 3 * ALIKE] for i in range(0, len(shown), 3 * ALIKE)]
+        assert len(windows) == 4
+        assert windows[0] != windows[1], "each epoch has an order of its own"
+        for stop in range(1, len(windows) + 1):
+            times = Counter(chain.from_iterable(windows[:stop]))
+            assert max(times.values()) - min(times[name] for name in own) <= 1
+
+
+def test_scenes_of_a_batch_have_like_numbers_of_objects(made: Path) -> None:
+    """Each batch is as wide as its largest scene."""
+
+    def padding(batches: Sequence[Batch]) -> int:
+        return sum(int((~batch.present).sum()) for batch in batches)
+
+    config = replace(PLAIN, scenes_per_batch=3, steps=4 * ALIKE)
+    alike = [batch for [batch] in reader(made, config).steps()]
+    stored = list(reader(made, config).whole(scenes=3))
+    assert padding(alike) / len(alike) < 0.5 * padding(stored) / len(stored)
 
 
 def test_most_goals_of_a_scene(made: Path) -> None:

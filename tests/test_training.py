@@ -32,6 +32,8 @@ from relevance.training import (
     measure,
     relevance_loss,
 )
+from relevance.training.losses import OBJECTS
+from relevance.training.trainer import reader_for
 
 torch.set_num_threads(1)  # threads that wait for each other crawl on a busy machine
 
@@ -128,6 +130,47 @@ def test_queries_are_drawn_uniformly(made: Path) -> None:
     assert count.min() > 0.8 * count.max(), "drawn twice in one batch, it is asked once"
 
 
+def objects(batch: Batch) -> float:
+    """Of a scene, on average."""
+    return float(batch.present.sum(-1).float().mean())
+
+
+def test_a_query_weighs_the_same_in_large_scenes_and_in_small_ones(made: Path) -> None:
+    """Scenes of a batch have like numbers of objects, so a mean over it would not do."""
+    model = RelevanceModel(GeometryConfig(width=32, heads=2, layers=1)).eval()
+    single = sorted(reader(made, CONFIG).whole(scenes=1), key=objects)
+    assert objects(single[0]) < objects(single[-1])
+    for batch in (single[0], single[-1]):
+        sums = []
+        for p, goals, relevant, labelled in batch.turns:
+            scores = model.decode(model.told_of(batch.present, batch.geometry), p, goals)
+            mean = relevance_loss(scores, relevant, labelled, CONFIG.eta(p)).item()
+            sums.append(mean * int(labelled.sum()) / int(labelled.any(-1).sum()))
+        found = batch_loss(model, batch, CONFIG)["relevance"].item()
+        assert found == pytest.approx(np.mean(sums) / OBJECTS, rel=1e-4)
+
+
+def test_first_it_is_told_then_it_is_shown(made: Path) -> None:
+    config = replace(CONFIG, told_share=0.5, steps=8, workers=0)
+    trainer, _ = trainer_of(made, config)
+    ahead = reader_for(reader(made, config).catalogue, trainer).steps()
+    eyes = {n: w.clone() for n, w in trainer.model.named_parameters() if ".scene." in n}
+    assert eyes
+    for step in range(config.steps):
+        found = trainer.take(ahead)
+        now = dict(trainer.model.named_parameters())
+        assert ("geometry" in found) == (step >= 4), (
+            "where objects are is not asked while it is told"
+        )
+        still = all(torch.equal(weight, now[name]) for name, weight in eyes.items())
+        assert still == (step < 4)
+    assert trainer.history[3].keys() != trainer.history[-1].keys()
+    # A body that cannot be told is shown from the first step on.
+    trainer, _ = trainer_of(made, replace(config, model=VitConfig.smoke()))
+    [batch] = next(reader_for(reader(made, config).catalogue, trainer).steps())
+    assert batch.image.any()
+
+
 def test_goal_objects_can_be_left_out_of_the_loss(made: Path) -> None:
     torch.manual_seed(0)
     model = RelevanceModel(VitConfig.smoke())
@@ -138,7 +181,7 @@ def test_goal_objects_can_be_left_out_of_the_loss(made: Path) -> None:
     queries = labelled.clone()
     for b, g in np.ndindex(*goals.shape[:2]):
         queries[b, g, goals[b, g]] = False
-    expected = relevance_loss(scores, relevant, queries, CONFIG.eta_on)
+    expected = objects(batch) / OBJECTS * relevance_loss(scores, relevant, queries, CONFIG.eta_on)
     found = batch_loss(model, batch, replace(CONFIG, goal_objects=False))["relevance"]
     assert found.item() == pytest.approx(expected.item(), rel=1e-5)
     assert found.item() != pytest.approx(batch_loss(model, batch, CONFIG)["relevance"].item())
@@ -192,6 +235,7 @@ def test_loss_weighs_each_predicate_with_its_eta(made: Path) -> None:
             for p, goals, relevant, labelled in batch.turns
         ]
         expected = sum(float(term.detach()) for term in terms) / len(terms)
+        expected *= objects(batch) / OBJECTS
         parts = batch_loss(model, batch, config)
         assert parts["loss"].item() == pytest.approx(expected, rel=1e-5)
         assert set(parts) == {"loss", "relevance"}

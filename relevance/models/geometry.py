@@ -2,8 +2,6 @@
 
 The ceiling of what the other bodies can reach with the same reasoning, and a guide of half a
 millisecond.
-
-Shape suffixes: B scenes, N objects (padded), G goals, D width.
 """
 
 from __future__ import annotations
@@ -12,15 +10,12 @@ from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
-from torch import Tensor, nn
+from torch import Tensor
 
 from relevance.configs import config
-from relevance.models.config import Answer, Encoding, ModelConfig, divides
-from relevance.models.layers import Attention, columns
-from relevance.models.reasoning import Reasoning, object_heads
-from relevance.models.registry import BODIES, Body, BodyKind
-from relevance.networks import GEOMETRY
-from relevance.scene import Predicate
+from relevance.models.config import Encoding, ModelConfig, ModelError, divides
+from relevance.models.reasoning import Thinker
+from relevance.models.registry import BODIES, BodyKind
 
 
 @config
@@ -47,35 +42,18 @@ class GeometryConfig(ModelConfig):
         return cls(width=32, heads=2, layers=1)
 
 
-class GeometryBody(Body):
-    """Tokens of the poses, attention among them, then the reasoning that `glimpse` ends with."""
+class GeometryBody(Thinker):
+    """Tokens of the poses, attention among them, then reasoning."""
 
     told = True
-    among_all = True
 
     def __init__(self, config: GeometryConfig, predicates: Sequence[str]) -> None:
         super().__init__()
-        width = config.width
-        self.token = nn.Sequential(nn.Linear(GEOMETRY, width), nn.GELU())
-        self.among = Attention(width, config.heads, expansion=2)
-        self.reason = Reasoning(width, config.heads, config.layers, predicates)
-        self.heads = object_heads(width, predicates)
+        self.thinks(config.width, config.heads, config.layers, predicates)
 
-    def encode(
-        self, image: Tensor, views: Tensor, present: Tensor, poses: Tensor | None
-    ) -> Encoding:
-        """As `RelevanceModel.encode`; the pictures are not looked at."""
-        assert poses is not None
-        tokens = self.among(self.token(poses), columns(present))
-        return Encoding(tokens=tokens, present=present, geometry=poses)
-
-    def decode(
-        self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
-    ) -> Answer:
-        """As `RelevanceModel.answer`."""
-        assert encoding.geometry is not None
-        x = self.reason(encoding.tokens, encoding.present, encoding.geometry, predicate, goals)
-        return Answer(scores=self.heads[predicate.name](x).squeeze(-1))
+    def encode(self, image: Tensor, views: Tensor, present: Tensor) -> Encoding:
+        """Never: it is told."""
+        raise ModelError("body geometry is told where objects are, expected poses")
 
 
 BODIES.register(

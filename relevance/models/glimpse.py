@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Literal, Self
 
 import torch
@@ -16,13 +17,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from relevance.configs import config
-from relevance.models.config import PATCH, STRIDE, Answer, Encoding, ModelConfig, Sight, divides
+from relevance.models.config import PATCH, STRIDE, Encoding, ModelConfig, Sight, divides
 from relevance.models.layers import Attention, columns, small_cnn
-from relevance.models.reasoning import Reasoning, object_heads
-from relevance.models.registry import BODIES, Body, BodyKind
+from relevance.models.reasoning import BETWEEN, Between, Thinker
+from relevance.models.registry import BODIES, BodyKind
 from relevance.models.tracing import sums, tracing, unshuffled, windows
 from relevance.networks import DECIMETRE, GEOMETRY
-from relevance.scene import Camera, Predicate, camera_up
+from relevance.scene import Camera, camera_up
 
 _GROUND = 0.035
 """Height at which a sight line is cut for a first guess of the position, m: half a box."""
@@ -56,18 +57,17 @@ class GlimpseConfig(ModelConfig):
         return cls(width=32, heads=2, layers=1, channels=8)
 
 
-class GlimpseBody(Body):
+class GlimpseBody(Thinker):
     """Find each object, look at it closely, then reason about the goal over all objects.
 
     Match: dot product of the view's embedding with a stride-4 feature map; softmax and
     soft-argmax in float32 say where the object is. Glimpse: the image window there,
     resampled to 32x32, goes through a small CNN together with the match map of the same
-    window. Geometry (position, size, footprint half-extents) is estimated from both and
-    given to the goal layers in the goal's own axes: along and across the predicate's
-    direction, from the reference and from the subject.
+    window. Geometry (position, size, footprint half-extents) is estimated from both, and again
+    with what lies between the objects known: a box at a fifth of a metre is a small one near by
+    or a large one behind, and what it stands on tells. From there on it is the body `geometry`,
+    told what was estimated and what was seen besides.
     """
-
-    among_all = True
 
     def __init__(self, config: GlimpseConfig, predicates: Sequence[str]) -> None:
         super().__init__()
@@ -88,19 +88,23 @@ class GlimpseBody(Body):
         self.look = small_cnn(4, (24, 48, 64), width)
         seen = 2 * width + 4
         self.estimate = nn.Sequential(nn.Linear(seen, width), nn.GELU(), nn.Linear(width, GEOMETRY))
-        self.token = nn.Sequential(nn.Linear(seen + GEOMETRY, width), nn.GELU())
-        self.among = Attention(width, config.heads, expansion=2)
-        self.reason = Reasoning(width, config.heads, config.layers, predicates)
-        self.heads = object_heads(width, predicates)
+        self.seen = nn.Sequential(nn.Linear(seen + GEOMETRY, width), nn.GELU())
+        self.between = Between()
+        self.settle = nn.ModuleList(
+            Attention(width, config.heads, expansion=2, between=BETWEEN) for _ in range(2)
+        )
+        self.correct, self.carry = nn.Linear(width, GEOMETRY), nn.Linear(width, width)
+        for layer in (self.correct, self.carry):  # at first nothing is added to what was there
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+        self.thinks(width, config.heads, config.layers, predicates)
         self.cells_P2: Tensor
         self.register_buffer("cells_P2", _cell_centres(config.camera), persistent=False)
 
-    def encode(
-        self, image: Tensor, views: Tensor, present: Tensor, poses: Tensor | None
-    ) -> Encoding:
+    def encode(self, image: Tensor, views: Tensor, present: Tensor) -> Encoding:
         """As `RelevanceModel.encode`, inputs float in 0..1."""
         batch, objects = views.shape[:2]
-        features_BEP = self._features(image).flatten(2)
+        features_BEP = unshuffled(self.scene, image).flatten(2)
         view_BND = self.view((views - 0.5).flatten(0, 1)).view(batch, objects, -1)
         key_BNE = self.view_key(view_BND)
         with torch.autocast(image.device.type, enabled=False):
@@ -117,20 +121,20 @@ class GlimpseBody(Body):
         seen = torch.cat([view_BND, look_BND, centre_BN2, ground_BN2], dim=-1)
         geometry = self.estimate(seen).float()
         geometry = torch.cat([geometry[..., :2] + ground_BN2, geometry[..., 2:]], dim=-1)
-        tokens = self.token(torch.cat([seen, geometry], dim=-1))
-        tokens = self.among(tokens, columns(present))
-        sight = None
+        x = self.seen(torch.cat([seen, geometry], dim=-1))
+        allowed, between = columns(present), self.between(geometry)
+        for layer in self.settle:
+            x = layer(x, allowed, between)
+        geometry = geometry + self.correct(x).float()
+        encoding = self.thought(self.token(geometry) + self.carry(x), present, geometry)
         if self.training:
             at = scene_K, place_K = present.nonzero(as_tuple=True)
             grid = image.shape[-2] // STRIDE, image.shape[-1] // STRIDE
             sight = Sight(
                 scene=scene_K, place=place_K, geometry=geometry[at], match=match_BNP[at], grid=grid
             )
-        return Encoding(tokens=tokens, present=present, geometry=geometry, sight=sight)
-
-    def _features(self, image: Tensor) -> Tensor:
-        """The stride-4 feature map, (B, E, h, w)."""
-        return unshuffled(self.scene, image) if tracing() else self.scene(image - 0.5)
+            encoding = replace(encoding, sight=sight)
+        return encoding
 
     def _window(self, image: Tensor, where_BNP: Tensor, centre_BN2: Tensor) -> Tensor:
         """Windows around the centres, (B*N, 4, 32, 32): colours and match map."""
@@ -154,14 +158,6 @@ class GlimpseBody(Body):
         peak = (where_BNP / where_BNP.amax(-1, keepdim=True)).view(shape)
         heat = F.grid_sample(peak, grid.view(-1, PATCH, PATCH, 2), align_corners=False)
         return torch.cat([colours.reshape(-1, 3, PATCH, PATCH), heat], dim=1)
-
-    def decode(
-        self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
-    ) -> Answer:
-        """As `RelevanceModel.answer`."""
-        assert encoding.geometry is not None
-        x = self.reason(encoding.tokens, encoding.present, encoding.geometry, predicate, goals)
-        return Answer(scores=self.heads[predicate.name](x).squeeze(-1))
 
 
 def _cell_centres(camera: Camera) -> Tensor:
@@ -193,7 +189,7 @@ BODIES.register(
     BodyKind(
         config=GlimpseConfig,
         make=GlimpseBody,
-        version="2",
+        version="3",
         advantage="sees the views of all objects, and learned from masks and poses",
     ),
 )

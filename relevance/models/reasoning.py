@@ -11,7 +11,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from relevance.models.config import Answer, Encoding
 from relevance.models.layers import Attention, columns, pick
+from relevance.models.registry import Body
 from relevance.models.tracing import tracing
 from relevance.networks import ANGLES, GEOMETRY
 from relevance.scene import Predicate, Robot
@@ -85,6 +87,37 @@ class Reasoning(nn.Module):
         for layer in self.layers:
             x = layer(x, allowed, between)
         return x[None] if tracing() else x.view(x_BGND.shape)
+
+
+class Thinker(Body):
+    """A body that thinks of where the objects are, whether it sees that or is told."""
+
+    among_all = True
+    tellable = True
+
+    def thinks(self, width: int, heads: int, layers: int, predicates: Sequence[str]) -> None:
+        """Make the layers; after all others, see `Body.heads`."""
+        self.token = nn.Sequential(nn.Linear(GEOMETRY, width), nn.GELU())
+        self.among = Attention(width, heads, expansion=2)
+        self.reason = Reasoning(width, heads, layers, predicates)
+        self.heads = object_heads(width, predicates)
+
+    def told_of(self, present: Tensor, poses: Tensor) -> Encoding:
+        """As `RelevanceModel.told_of`."""
+        return self.thought(self.token(poses), present, poses)
+
+    def thought(self, tokens: Tensor, present: Tensor, geometry: Tensor) -> Encoding:
+        """What is known of each object, tokens (B, N, D), and where it is, (B, N, GEOMETRY)."""
+        tokens = self.among(tokens, columns(present))
+        return Encoding(tokens=tokens, present=present, geometry=geometry)
+
+    def decode(
+        self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
+    ) -> Answer:
+        """As `RelevanceModel.answer`."""
+        assert encoding.geometry is not None
+        x = self.reason(encoding.tokens, encoding.present, encoding.geometry, predicate, goals)
+        return Answer(scores=self.heads[predicate.name](x).squeeze(-1))
 
 
 def object_heads(width: int, predicates: Sequence[str]) -> nn.ModuleDict:

@@ -32,6 +32,9 @@ class Body(nn.Module, ABC):
     told = False
     """Whether it is told where the objects are instead of being shown them."""
 
+    tellable = False
+    """Whether it thinks of where objects are, so that it can learn that by being told."""
+
     among_all = False
     """Whether a score depends on all objects of the scene, not on the three views alone."""
 
@@ -39,10 +42,12 @@ class Body(nn.Module, ABC):
     """Whether ONNX Runtime gets a graph of it, where one can be made."""
 
     @abstractmethod
-    def encode(
-        self, image: Tensor, views: Tensor, present: Tensor, poses: Tensor | None
-    ) -> Encoding:
+    def encode(self, image: Tensor, views: Tensor, present: Tensor) -> Encoding:
         """As `RelevanceModel.encode`, pictures float in 0..1."""
+
+    def told_of(self, present: Tensor, poses: Tensor) -> Encoding:
+        """As `RelevanceModel.told_of`."""
+        raise ModelError(f"{type(self).__name__} cannot be told where objects are")
 
     @abstractmethod
     def decode(
@@ -107,6 +112,11 @@ class RelevanceModel(nn.Module):
         """Whether `encode` needs poses; the pictures are nothing to it then."""
         return self.body.told
 
+    @property
+    def tellable(self) -> bool:
+        """Whether it sees pictures, and can be told poses instead (`told_of`)."""
+        return self.body.tellable and not self.body.told
+
     def encode(
         self,
         image: Tensor,
@@ -132,12 +142,15 @@ class RelevanceModel(nn.Module):
         if present is None:
             present = torch.ones(views.shape[:2], dtype=torch.bool)
         device = self.device
-        return self.body.encode(
-            _unit(image.to(device)),
-            _unit(views.to(device)),
-            present.to(device),
-            None if poses is None else poses.to(device),
-        )
+        present = present.to(device)
+        if self.told:
+            assert poses is not None
+            return self.body.told_of(present, poses.to(device))
+        return self.body.encode(_unit(image.to(device)), _unit(views.to(device)), present)
+
+    def told_of(self, present: Tensor, poses: Tensor) -> Encoding:
+        """The same with the true poses in the place of pictures, for bodies that are `tellable`."""
+        return self.body.told_of(present.to(self.device), poses.to(self.device))
 
     def decode(
         self,

@@ -106,9 +106,7 @@ class ResnetBody(Body):
             {name: Extractor(config.width, config.hidden) for name in predicates}
         )
 
-    def encode(
-        self, image: Tensor, views: Tensor, present: Tensor, poses: Tensor | None
-    ) -> Encoding:
+    def encode(self, image: Tensor, views: Tensor, present: Tensor) -> Encoding:
         """As `RelevanceModel.encode`, pictures float in 0..1."""
         views_BNC = self.view((views - 0.5).flatten(0, 1)).unflatten(0, views.shape[:2])
         return Encoding(tokens=views_BNC, present=present, scene=self.scene(image - 0.5))

@@ -83,9 +83,7 @@ class Resnet3dBody(Body):
             {name: Extractor(config.width, config.hidden) for name in predicates}
         )
 
-    def encode(
-        self, image: Tensor, views: Tensor, present: Tensor, poses: Tensor | None
-    ) -> Encoding:
+    def encode(self, image: Tensor, views: Tensor, present: Tensor) -> Encoding:
         """As `RelevanceModel.encode`, pictures float in 0..1; only cuts the patches out."""
         patches = F.unfold(image - 0.5, PATCH, stride=PATCH).transpose(1, 2)
         return Encoding(tokens=(views - 0.5).flatten(2), present=present, scene=patches)

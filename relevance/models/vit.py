@@ -107,9 +107,7 @@ class ViTBody(Body):
         self.taught = Taught(width, config.camera) if config.taught else None
         self.heads = nn.ModuleDict({name: Extractor(width, config.hidden) for name in predicates})
 
-    def encode(
-        self, image: Tensor, views: Tensor, present: Tensor, poses: Tensor | None
-    ) -> Encoding:
+    def encode(self, image: Tensor, views: Tensor, present: Tensor) -> Encoding:
         """As `RelevanceModel.encode`, pictures float in 0..1."""
         image_BPD = self.embed(image - 0.5).flatten(2).transpose(1, 2) + self.positions[1:]
         views_BND = self.embed((views - 0.5).flatten(0, 1)).view(*views.shape[:2], -1)

@@ -7,6 +7,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
+from relevance.models import RelevanceModel
 from relevance.store import Dataset
 from relevance.training.catalogue import Catalogue
 from relevance.training.settings import TrainConfig
@@ -28,7 +29,17 @@ def steps_within(root: str | Path, config: TrainConfig, seconds: float, device: 
     The first round of turns fills what scenes are drawn from; it is paid once.
     """
     config = one_core(replace(config, steps=10**9), device)
-    catalogue = Catalogue.of(Dataset.open(root), "train", config)
+    dataset = Dataset.open(root)
+    first, each, turns = _costs(dataset, replace(config, told_share=0.0), seconds)
+    if config.told_share and RelevanceModel(config.model).tellable:
+        _, told, _ = _costs(dataset, replace(config, told_share=1 - 1e-6), seconds)
+        each = config.told_share * told + (1 - config.told_share) * each
+    return turns + max(0, int((seconds - first) / each))
+
+
+def _costs(dataset: Dataset, config: TrainConfig, seconds: float) -> tuple[float, float, int]:
+    """Seconds of the first round of turns and of each later step, and the steps of a round."""
+    catalogue = Catalogue.of(dataset, "train", config)
     turns = len(catalogue.groups if config.share_encodings else catalogue.predicates)
     with on_threads(1):
         trainer = Trainer(config, catalogue.predicates)
@@ -43,5 +54,4 @@ def steps_within(root: str | Path, config: TrainConfig, seconds: float, device: 
             first = now = a_round()
             while now < first + _SHARE * seconds or trainer.done == turns:
                 now = a_round()
-    each = (now - first) / (trainer.done - turns)
-    return turns + max(0, int((seconds - first) / each))
+    return first, (now - first) / (trainer.done - turns), turns

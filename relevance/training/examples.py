@@ -69,6 +69,8 @@ class Batch:
     """(B, h, w) uint8: the mask at the centres of the stride-4 cells."""
     names: tuple[str, ...]
     """Ids of the scenes, B."""
+    told: bool = False
+    """Whether it is for being told of, not shown: the pictures are blank."""
     families: tuple[str, ...] = ()
     """What kinds of scenes they are, B."""
     objects: tuple[tuple[str, ...], ...] = ()
@@ -103,6 +105,7 @@ def _numbers(batch: Batch, change: Callable[[Any], Any]) -> dict[str, Any]:
     return {
         "present": change(batch.present),
         "cells": change(batch.cells),
+        "told": batch.told,
         "names": batch.names,
         "families": batch.families,
         "objects": batch.objects,
@@ -139,6 +142,7 @@ def batch_of(
         views=views,
         present=torch.from_numpy(present),
         cells=cells,
+        told=not pictures,
         names=tuple(example.name for example in examples),
         families=tuple(example.family for example in examples),
         objects=tuple(tuple(scene.names) for scene in scenes),

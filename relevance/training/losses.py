@@ -16,10 +16,16 @@ from relevance.models import GEOMETRY, RelevanceModel, Sight
 from relevance.training.examples import Batch
 from relevance.training.settings import TrainConfig
 
+OBJECTS = 6.5
+"""Objects of a batch that weighs 1."""
+
 
 def batch_loss(model: RelevanceModel, batch: Batch, config: TrainConfig) -> dict[str, Tensor]:
     """The loss of a batch and its parts; every scene is encoded once for all its goals."""
-    encoding = model.encode(batch.image, batch.views, batch.present, batch.geometry)
+    if batch.told and model.tellable:
+        encoding = model.told_of(batch.present, batch.geometry)
+    else:
+        encoding = model.encode(batch.image, batch.views, batch.present, batch.geometry)
     parts: dict[str, Tensor] = {}
     terms, sights = [], [encoding.sight]
     for predicate, goals, relevant, labelled in batch.turns:
@@ -30,6 +36,9 @@ def batch_loss(model: RelevanceModel, batch: Batch, config: TrainConfig) -> dict
         terms.append(relevance_loss(answer.scores, relevant, labelled, config.eta(predicate)))
         sights.append(answer.sight)
     parts["relevance"] = torch.stack(terms).mean()
+    if not config.queries_per_batch:
+        # Scenes of a batch have like numbers of objects: so each query weighs the same in all.
+        parts["relevance"] = parts["relevance"] * batch.present.sum(-1).float().mean() / OBJECTS
     loss = config.relevance_weight * parts["relevance"]
     parts |= _look_losses([sight for sight in sights if sight], batch)
     weights = {
@@ -69,7 +78,7 @@ def _look_losses(sights: Sequence[Sight], batch: Batch) -> dict[str, Tensor]:
         found.setdefault("mask", []).append(_mask_loss(sight.match, shown))
         if sight.attention is not None:
             found.setdefault("attention", []).append(_mask_loss(sight.attention, shown))
-        error = F.smooth_l1_loss(sight.geometry, batch.geometry[at], beta=0.1, reduction="none")
+        error = F.smooth_l1_loss(sight.geometry, batch.geometry[at], beta=0.02, reduction="none")
         parts = [error[:, a:b].mean() for a, b in ((0, 3), (3, 6), (6, GEOMETRY))]
         found.setdefault("geometry", []).append(torch.stack(parts).sum())
     return {name: torch.stack(values).mean() for name, values in found.items()}

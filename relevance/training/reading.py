@@ -1,9 +1,10 @@
 """The reader that trains: labelled scenes in an order of seed and step, from the shards themselves.
 
 A look is what is decoded at once: some scenes, for predicates that take turns on them. Each group
-of predicates goes through the shards that it has labels in, in an order of each epoch of its own,
-and all its examples come before any comes again. Which look a step takes is arithmetic, so a run
-that goes on begins where it was: what was consumed is passed over undecoded.
+of predicates goes through the shards that it has labels in, in an order of each epoch of its own;
+after every few looks (`ALIKE`) no example has come twice more than another. Which look a step
+takes is arithmetic, so a run that goes on begins where it was: what was consumed is passed over
+undecoded.
 """
 
 from __future__ import annotations
@@ -39,6 +40,9 @@ class TrainingError(RelevanceError):
 
 SCENES, QUERIES = 1000, 20_000
 """Scenes, or single queries, from which a shuffled one is drawn."""
+ALIKE = 8
+"""Looks whose scenes are sorted by their number of objects, so that little is padding: a third of
+all objects was, and costs as much as what is there."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +53,8 @@ class Look:
     number: int
     """How many looks these predicates took before."""
     examples: tuple[Example, ...]
+    told: bool = False
+    """Whether its pictures stay undecoded."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +68,8 @@ class Reader:
     config: TrainConfig
     pictures: bool = True
     """Whether images are decoded; else they are blank."""
+    told: float = 0.0
+    """Share of the looks of each group of predicates, its first ones, whose images are blank."""
     workers: int = 0
     """Processes that read and decode; 0: it is done where the batches are asked for."""
     rank: int = 0
@@ -78,9 +86,9 @@ class Reader:
 
     def steps(self, first: int = 0) -> Generator[list[Batch]]:
         """What each step learns from, from step `first` to the last of the run."""
-        groups, last = self.catalogue.groups, self.config.steps - 1
+        groups = self.catalogue.groups
         begin = looks_of(first, groups, self.config)[0][0]
-        end = looks_of(last, groups, self.config)[-1][0] + 1
+        end = self._looks_in_all
         looks = polled(self._streams(begin), self._learned, count=end - begin, workers=self.workers)
         ahead = enumerate(looks, begin)
         at, batch = next(ahead)
@@ -108,6 +116,12 @@ class Reader:
         )
         return polled([stream], self._asked, count=None, workers=self.workers)
 
+    @property
+    def _looks_in_all(self) -> int:
+        """Looks of a run, of all groups."""
+        last = looks_of(self.config.steps - 1, self.catalogue.groups, self.config)
+        return last[-1][0] + 1
+
     # looks ------------------------------------------------------------------------------------
 
     def _streams(self, begin: int) -> list[Iterator[Look]]:
@@ -125,9 +139,25 @@ class Reader:
     def _looks(self, group: int, first: int) -> Iterator[Look]:
         """The looks of a group from its number `first`, epoch after epoch."""
         size = self.config.queries_per_batch or self.config.scenes_per_batch
-        epoch, passed = divmod(first * size, sum(self.catalogue.counts[group].values()))
+        into = 0 if self.config.queries_per_batch else first % ALIKE
+        begin = first - into
+        epoch, passed = divmod(begin * size, sum(self.catalogue.counts[group].values()))
         examples = chain.from_iterable(self._epoch(group, number) for number in count(epoch))
-        return _cut(self.catalogue.groups[group], islice(examples, passed, None), size, first)
+        looks = _cut(self.catalogue.groups[group], islice(examples, passed, None), size, begin)
+        if not self.config.queries_per_batch:
+            looks = islice(self._alike(looks), into, None)
+        blank = int(self.told * self._looks_in_all / len(self.catalogue.groups))
+        return (replace(look, told=look.number < blank) for look in looks)
+
+    def _alike(self, looks: Iterator[Look]) -> Iterator[Look]:
+        """The same scenes, those of a few looks sorted by their number of objects."""
+        while some := tuple(islice(looks, ALIKE)):
+            size, predicates, first = len(some[0].examples), some[0].predicates, some[0].number
+            scenes = sorted(chain.from_iterable(look.examples for look in some), key=_objects)
+            order = _rng(self.config.seed, 4, predicates, first).permutation(len(some))
+            for number, place in enumerate(order, first):
+                examples = tuple(scenes[place * size : (place + 1) * size])
+                yield Look(predicates=predicates, number=number, examples=examples)
 
     def _epoch(self, group: int, number: int) -> Iterator[Example]:
         """All examples of a group, shuffled: scenes with their goals, or with one query each."""
@@ -163,7 +193,8 @@ class Reader:
                 self._some_goals(example, _rng(config.seed, 3, look.predicates, place))
                 for place, example in zip(count(first, self.ranks), examples, strict=False)
             ]
-        batch = batch_of(examples, look.predicates, config.model.camera, pictures=self.pictures)
+        pictures = self.pictures and not look.told
+        batch = batch_of(examples, look.predicates, config.model.camera, pictures=pictures)
         rng = _rng(config.seed, 2, look.predicates, look.number)
         if config.recolor:
             batch = recolored(batch, torch.from_numpy(rng.permutation(3)))
@@ -191,6 +222,12 @@ def _cut(
         if not (some := tuple(islice(examples, size))):
             return
         yield Look(predicates=predicates, number=number, examples=some)
+
+
+def _objects(example: Example) -> int:
+    """How many objects the scene has: labels are about all of them."""
+    (answers, *_) = example.answers.values()
+    return len({answer.query for answer in answers})
 
 
 def _together(examples: tuple[Example, ...]) -> list[Example]:

@@ -53,6 +53,10 @@ class TrainConfig:
     scene_goals: Annotated[int, Field(ge=0)] = 0
     """Of each scene and predicate, the most goals that are learned from, always the same; all
     with 0."""
+    told_share: Share = 0.0
+    """Share of the steps, the first ones, in which a body that thinks of where objects are
+    (`glimpse`) is told that and shown no picture: a step costs a third, and it learns to think
+    before it learns to see. Nothing to other bodies."""
     start: str = ""
     """Id of a checkpoint of the dataset whose weights are taken over and stay as they are: only
     heads that it lacks are trained, those of `predicates`."""

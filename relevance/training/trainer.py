@@ -72,7 +72,7 @@ class Trainer:
         """Processor time of this process in them; all of it where no other one reads ahead."""
         self.history: list[dict[str, float]] = []
         """Loss and its parts, averaged between two entries; each with its step."""
-        self._sums: dict[str, float] = {}
+        self._sums: dict[str, tuple[float, int]] = {}
         self.scenes = 0
         """Scenes that were shown, each time one was."""
         self.asked: dict[str, int] = {}
@@ -156,12 +156,12 @@ class Trainer:
         return values
 
     def _record(self, values: dict[str, float]) -> None:
-        for name, value in {**values, "steps": 1.0}.items():
-            self._sums[name] = self._sums.get(name, 0.0) + value
+        for name, value in values.items():
+            total, count = self._sums.get(name, (0.0, 0))
+            self._sums[name] = total + value, count + 1
         every = max(1, self.config.steps // 100)
         if self.done % every == 0 or self.done == self.config.steps:
-            count = self._sums.pop("steps")
-            means = {name: total / count for name, total in self._sums.items()}
+            means = {name: total / count for name, (total, count) in self._sums.items()}
             self.history.append({"step": float(self.done), **means})
             self._sums = {}
 
@@ -421,6 +421,7 @@ def reader_for(catalogue: Catalogue, trainer: Trainer) -> Reader:
         catalogue=catalogue,
         config=trainer.config,
         pictures=not trainer.model.told,
+        told=trainer.config.told_share if trainer.model.tellable else 0.0,
         workers=ahead,
         rank=trainer.ranks.rank,
         ranks=trainer.ranks.count,
