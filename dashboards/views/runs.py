@@ -36,7 +36,7 @@ def checkpoints() -> None:
                 "minutes": row["train_seconds"] / 60,
                 "body": row["body"],
                 "preset": row["preset"],
-                "trained on from": row["continues"],
+                "trained on from": row["continues"] or "",
                 "label policy": row["policy"],
                 "scored objects": row["predictions"],
                 "reruns": row["reruns"],
@@ -59,7 +59,7 @@ def checkpoints() -> None:
                     "at (UTC)": datetime.fromisoformat(event.at),
                     "what": event.what,
                     "checkpoint": event.checkpoint_id,
-                    "champion before": event.before,
+                    "champion before": event.before or "",
                     "why": event.why,
                 }
                 for event in reversed(record.history)

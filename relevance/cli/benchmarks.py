@@ -1,4 +1,4 @@
-"""The subcommands `bench planner`, `bench guides`, `bench dataset` and `bench training`."""
+"""The subcommands `bench planner`, `guides`, `dataset`, `training` and `sight`."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import math
@@ -251,6 +251,43 @@ def _training(_: Preset) -> Callable[..., int]:
     return bench
 
 
+def _sight(_: Preset) -> Callable[..., int]:
+    def bench(
+        dataset: tyro.conf.Positional[Path],
+        sees: str = "glimpse",
+        told: str = "geometry",
+        split: Literal["train", "validation", "test"] = "test",
+        scenes: int = 60,
+        out: OptionalFolder = None,
+    ) -> int:
+        """Measure what seeing costs: where objects are seen, and which part of it costs accuracy.
+
+        A network that is told where objects are is told what another one sees instead, all of it
+        or a part.
+
+        Args:
+            dataset: Folder of a labelled dataset.
+            sees: Checkpoint of a body that sees where objects are: an id, a file, a name.
+            told: Checkpoint of a body that is told that.
+            split: Whose scenes.
+            scenes: The first so many of each shard.
+            out: Folder for the tables and their rows as CSV; data/bench/sight when not given.
+        """
+        from relevance.benchmarks.sight import measure_sight
+
+        at_least("--scenes", scenes, 1)
+        folder = out or Path("data/bench/sight")
+        folder.mkdir(parents=True, exist_ok=True)
+        with bar("shards") as progress:
+            measured = measure_sight(
+                dataset, sees=sees, told=told, split=split, scenes=scenes, progress=progress
+            )
+        hand_over(measured, folder)
+        return 0
+
+    return bench
+
+
 COMMANDS = {
     "bench planner": Command(
         make=bench_planner,
@@ -286,5 +323,10 @@ COMMANDS = {
             "relevance bench training",
             "relevance bench training --sizes paper --device cuda --scenes 16 --seconds 20",
         ),
+    ),
+    "bench sight": Command(
+        make=_sight,
+        about="what it costs to see where objects are",
+        examples=("relevance bench sight data/tables",),
     ),
 }

@@ -41,9 +41,12 @@ from relevance.training.speed import Speed, measure_speed
 from relevance.training.studies import RECIPES, STUDIES, Run, Study
 from relevance.training.studying import Plan, run_study
 from relevance.training.trainer import (
+    Judged,
     Trainer,
     continued,
+    judged,
     measure,
+    metrics_of,
     precision,
     train,
     use_bfloat16,
@@ -59,6 +62,7 @@ __all__ = [
     "Catalogue",
     "CheckpointError",
     "Example",
+    "Judged",
     "Looks",
     "Plan",
     "Ranks",
@@ -77,9 +81,11 @@ __all__ = [
     "continued",
     "find_checkpoint",
     "graphs_of",
+    "judged",
     "load_checkpoint",
     "measure",
     "measure_speed",
+    "metrics_of",
     "one_core",
     "pick_device",
     "polling",
