@@ -18,10 +18,10 @@ from torch.nn import functional as F
 
 from relevance.configs import config
 from relevance.models.config import PATCH, STRIDE, Encoding, ModelConfig, Sight, divides
-from relevance.models.layers import Attention, columns, small_cnn
+from relevance.models.layers import Attention, columns, small_cnn, unshuffled
 from relevance.models.reasoning import BETWEEN, Between, Thinker
 from relevance.models.registry import BODIES, BodyKind
-from relevance.models.tracing import sums, tracing, unshuffled, windows
+from relevance.models.tracing import sums, tracing, windows
 from relevance.networks import DECIMETRE, GEOMETRY
 from relevance.scene import Camera, camera_up
 
@@ -63,10 +63,10 @@ class GlimpseBody(Thinker):
     Match: dot product of the view's embedding with a stride-4 feature map; softmax and
     soft-argmax in float32 say where the object is. Glimpse: the image window there,
     resampled to 32x32, goes through a small CNN together with the match map of the same
-    window. Geometry (position, size, footprint half-extents) is estimated from both, and again
-    with what lies between the objects known: a box at a fifth of a metre is a small one near by
-    or a large one behind, and what it stands on tells. From there on it is the body `geometry`,
-    told what was estimated and what was seen besides.
+    window. Geometry (position, size, footprint half-extents) is estimated from both, then
+    settled with what lies between the objects known: what a box stands on tells whether it is a
+    small one near by or a large one behind. From there on it is the body `geometry`, told what
+    was estimated and what was seen besides.
     """
 
     def __init__(self, config: GlimpseConfig, predicates: Sequence[str]) -> None:

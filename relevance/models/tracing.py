@@ -14,9 +14,8 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from relevance.models.config import PATCH, STRIDE
+from relevance.models.config import PATCH
 
 _TILE = 16
 """Pixels of a row that are copied together."""
@@ -25,21 +24,6 @@ _TILE = 16
 def tracing() -> bool:
     """Whether a graph is being made, in place of numbers."""
     return torch.onnx.is_in_onnx_export()
-
-
-def unshuffled(layers: nn.Sequential, image_BCHW: Tensor) -> Tensor:
-    """`layers`, which begin with a PixelUnshuffle and a convolution of 1x1, of image - 0.5.
-
-    The two are one convolution whose stride is its size, and it shifts the pixels, too: two
-    copies of the image less. What follows is faster with the channels last.
-    """
-    first, rest = layers[1], layers[2:]
-    assert isinstance(first, nn.Conv2d)
-    assert first.bias is not None
-    weight = first.weight.view(first.out_channels, -1, STRIDE, STRIDE)
-    shift = first.bias - weight.sum((1, 2, 3)) / 2
-    found = F.conv2d(image_BCHW, weight, shift, stride=STRIDE)
-    return rest(found if tracing() else found.contiguous(memory_format=torch.channels_last))
 
 
 def sums(x_BEK: Tensor) -> Tensor:
