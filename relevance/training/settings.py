@@ -144,7 +144,7 @@ class TrainConfig:
         """
         return cls(
             preset="demo",
-            steps=2200,
+            steps=2500,
             scenes_per_batch=4,
             goals_per_scene=3,
             recolor=False,
