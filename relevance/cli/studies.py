@@ -54,8 +54,9 @@ def _study(_: Preset) -> Callable[..., int]:
             models: Where what comes with the package is written to (study ship, study crowd).
         """
         from relevance.benchmarks.studies import markdown, tabulate
+        from relevance.evaluation import tune_once
         from relevance.store import replacing
-        from relevance.training import Plan, TrainConfig, run_study, ship
+        from relevance.training import Plan, TrainConfig, find_checkpoint, run_study, ship
 
         at_least("--minutes", minutes, 0)
         at_least("--goals", goals, 0)
@@ -71,6 +72,9 @@ def _study(_: Preset) -> Callable[..., int]:
         for row in rows:
             if row["ship"]:
                 config = TrainConfig.from_dict(row["config"])
+                with bar("tasks") as progress:
+                    made = find_checkpoint(dataset, row["checkpoint_id"])
+                    tune_once(dataset, made, progress=progress)
                 print(ship(dataset, config, models, name=row["ship"]))
         return 0
 
