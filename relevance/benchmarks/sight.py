@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from relevance.benchmarks.runs import Measured, Progress
 from relevance.models import RelevanceModel
@@ -122,12 +121,16 @@ def _loaded(
     return model.eval(), meta
 
 
-def _seen(model: RelevanceModel, batch: Batch) -> torch.Tensor:
+def _seen(model: RelevanceModel, batch: Batch) -> Any:
     """Where a model sees the objects of a batch, (B, N, GEOMETRY)."""
-    with torch.inference_mode():
-        geometry = model.encode(batch.image, batch.views, batch.present).geometry
-    assert geometry is not None
-    return geometry.float().clone()
+    seen = batch.geometry.clone()
+    images = batch.image.permute(0, 2, 3, 1).numpy()
+    views = batch.views.permute(0, 1, 3, 4, 2).numpy()
+    for place, names in enumerate(batch.objects):
+        objects = slice(len(names))
+        found = model.believed(model.look(images[place], views[place, objects], None))
+        seen.numpy()[place, objects] = found
+    return seen
 
 
 def _rows(told: str, found: list[Judged]) -> Iterator[Seen]:

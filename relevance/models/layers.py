@@ -107,7 +107,7 @@ class Extractor(nn.Module):
         return self.score(F.relu(self.second(hidden))).squeeze(-1)
 
 
-def unshuffled(layers: nn.Sequential, image_BCHW: Tensor) -> Tensor:
+def unshuffled(layers: nn.Sequential, image: Tensor) -> Tensor:
     """`layers`, which begin with a PixelUnshuffle and a convolution of 1x1, of image - 0.5.
 
     The two are one convolution whose stride is its size, and it shifts the pixels, too: two
@@ -118,7 +118,7 @@ def unshuffled(layers: nn.Sequential, image_BCHW: Tensor) -> Tensor:
     assert first.bias is not None
     weight = first.weight.view(first.out_channels, -1, STRIDE, STRIDE)
     shift = first.bias - weight.sum((1, 2, 3)) / 2
-    found = F.conv2d(image_BCHW, weight, shift, stride=STRIDE)
+    found = F.conv2d(image, weight, shift, stride=STRIDE)
     return rest(found if tracing() else found.contiguous(memory_format=torch.channels_last))
 
 
