@@ -66,7 +66,7 @@ def test_attention_of_a_view_is_shared_out_among_the_patches() -> None:
     body = made(VitConfig(width=32, heads=4, layers=2, hidden=8, taught=True)).body.train()
     assert isinstance(body, ViTBody)
     batch = made_up_batch(VitConfig().camera, scenes=2, goals=1, objects=3)
-    encoding = body.encode(batch.image / 255, batch.views / 255, batch.present, None)
+    encoding = body.encode(batch.image / 255, batch.views / 255, batch.present)
     assert encoding.sight is not None
     assert encoding.sight.attention is not None
     assert encoding.sight.attention.shape == (2 * 3, 60)

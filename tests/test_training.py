@@ -260,7 +260,7 @@ def test_a_network_learns_a_few_scenes_by_heart(made: Path, body: str) -> None:
     config = replace(
         CONFIG,
         model=model,
-        steps=80,
+        steps=144,
         scenes_per_batch=6,
         learning_rate=3e-3,
         mirror=False,
@@ -273,7 +273,9 @@ def test_a_network_learns_a_few_scenes_by_heart(made: Path, body: str) -> None:
     before = measure(trainer.model, reader(made, config).whole())
     losses = [trainer.take(ahead) for _ in range(config.steps)]
     after = measure(trainer.model, reader(made, config).whole())
-    assert np.mean([x["relevance"] for x in losses[-6:]]) < 0.5 * losses[0]["relevance"]
+    # Batches of large scenes weigh more: like is held against like, all sizes against all.
+    first, last = (np.mean([x["relevance"] for x in some]) for some in (losses[:16], losses[-16:]))
+    assert last < 0.65 * first
     for family in ("same-plane", "on"):
         found = after[family]["with_goal_objects"]
         assert found["balanced"] > 0.8 > before[family]["with_goal_objects"]["balanced"]
