@@ -275,7 +275,7 @@ def test_a_network_learns_a_few_scenes_by_heart(made: Path, body: str) -> None:
     after = measure(trainer.model, reader(made, config).whole())
     # Batches of large scenes weigh more: like is held against like, all sizes against all.
     first, last = (np.mean([x["relevance"] for x in some]) for some in (losses[:16], losses[-16:]))
-    assert last < 0.65 * first
+    assert last < 0.5 * first
     for family in ("same-plane", "on"):
         found = after[family]["with_goal_objects"]
         assert found["balanced"] > 0.8 > before[family]["with_goal_objects"]["balanced"]

@@ -41,8 +41,7 @@ PARTS: Mapping[str, slice] = {
 TOLD: Mapping[str, tuple[str, ...]] = {
     "what is there": (),
     "all as it is seen": tuple(PARTS),
-    **{f"{part} as it is seen": (part,) for part in ("along the view (x)", "across the view (y)")},
-    "height (z) as it is seen": ("height (z)",),
+    **{f"{part} as it is seen": (part,) for part in [*PARTS][:3]},
     "sizes as they are seen": ("size", "half-extents"),
 }
 """What the other one is told, by which parts of it are those that are seen."""

@@ -22,7 +22,7 @@ OBJECTS = 6.5
 
 def batch_loss(model: RelevanceModel, batch: Batch, config: TrainConfig) -> dict[str, Tensor]:
     """The loss of a batch and its parts; every scene is encoded once for all its goals."""
-    if batch.told and model.tellable:
+    if batch.told:
         encoding = model.told_of(batch.present, batch.geometry)
     else:
         encoding = model.encode(batch.image, batch.views, batch.present, batch.geometry)
