@@ -5,6 +5,7 @@ An object is kept iff its score > -beta (CONTRIBUTING, The words), everywhere.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -124,6 +125,16 @@ def average_precision(score: np.ndarray, relevant: np.ndarray) -> float:
         return float("nan")
     last = np.flatnonzero(np.r_[ranked[1:] < ranked[:-1], True])  # equal scores come together
     return float(np.diff(hits[last], prepend=0) @ (hits[last] / (last + 1)) / hits[-1])
+
+
+def recall_at(score: np.ndarray, relevant: np.ndarray, true_irrelevant: float = 0.95) -> float:
+    """The share of the relevant objects that is kept by the lowest threshold that leaves out at
+    least so many of the irrelevant ones; nan without either kind."""
+    others = np.sort(score[~relevant])
+    if not len(others) or not relevant.any():
+        return float("nan")
+    left_out = math.ceil(true_irrelevant * len(others) - 1e-9)  # 0.95 * 20 may be more than 19
+    return mean(score[relevant] > others[max(1, left_out) - 1])
 
 
 def calibration_error(score: np.ndarray, relevant: np.ndarray) -> float:

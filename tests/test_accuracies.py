@@ -34,6 +34,7 @@ from relevance.metrics import (
     average_precision,
     best_beta,
     calibration_error,
+    recall_at,
 )
 from relevance.models import BODIES, RelevanceModel
 from relevance.scene import Goal, Robot
@@ -151,6 +152,17 @@ def test_no_beta_judges_more_rightly_than_the_best_and_none_as_good_is_much_near
     as_good = [beta for beta in others if total(beta) == total(best)]
     gaps = np.diff(np.unique(score), prepend=-12, append=12)
     assert abs(best) <= min(map(abs, as_good)) + gaps.max() / 2
+
+
+def test_recall_where_most_of_the_irrelevant_are_left_out_by_hand() -> None:
+    relevant = np.array([True] * 4 + [False] * 20)
+    score = np.array([25.0, 18.5, 19.5, -1.0, *range(20)])  # 19 of 20 irrelevant: up to 18
+    assert recall_at(score, relevant) == 3 / 4
+    assert recall_at(score, relevant, 0.951) == 2 / 4
+    assert recall_at(score, relevant, 1.0) == 2 / 4
+    assert recall_at(np.zeros(24), relevant) == 0, "a constant score keeps none"
+    assert math.isnan(recall_at(score[:4], relevant[:4]))
+    assert math.isnan(recall_at(score[4:], relevant[4:]))
 
 
 def test_average_precision_by_hand() -> None:

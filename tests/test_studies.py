@@ -313,26 +313,33 @@ def test_figures_are_those_of_an_evaluation(tiny: str, tmp_path: Path) -> None:
         for column in ("relevant", "task", "predicate", "is_goal_object"):
             np.testing.assert_array_equal(getattr(mine, column), getattr(its, column))
         found = {
-            (s.group, s.goals, s.stands): s
+            (s.group, s.goals, s.stands, s.boxes): s
             for s in measured.rows
             if s.run == row["run"] and s.judge == NETWORK
         }
         for line in accuracy_table(its.queries()):
             if line["judge"] == NETWORK:
-                one = found[line["family"], "all goals", ""]
+                one = found[line["family"], "all goals", "", ""]
                 for figure in names:
                     assert getattr(one, figure) == pytest.approx(line[figure], nan_ok=True)
                 metrics = row["test"][line["family"]]["queries"]
                 assert metrics["total"] == pytest.approx(line["total"])
         for line in breakdown_table(its.queries(), "stands"):
-            one = found[line["family"], "all goals", line["stands"]]
+            one = found[line["family"], "all goals", line["stands"], ""]
             assert one.total == pytest.approx(line["total"])
-    rules = {(s.group, s.goals, s.stands): s for s in measured.rows if s.judge == RULE}
+        sizes = [one for one in found.values() if one.boxes]
+        assert sizes
+        for one in sizes:
+            n = its.queries().of(one.group).n_objects
+            least, most = map(int, one.boxes.split(" to "))
+            assert one.queries == ((n >= least) & (n <= most)).sum()
+    ruled = [s for s in measured.rows if s.judge == RULE]
+    rules = {(s.group, s.goals, s.stands, s.boxes): s for s in ruled}
     queries = read_predictions(dataset, rows[0]["checkpoint_id"]).queries()
     part = queries.of("on")
     expected = Accuracy.of(JUDGES[RULE](part), part.relevant, task=part.task)
-    assert rules["on", "all goals", ""].total == expected.total
-    assert len(rules) == len({(s.group, s.goals, s.stands) for s in measured.rows})
+    assert rules["on", "all goals", "", ""].total == expected.total
+    assert len(rules) == len(ruled), "each group is judged once by a rule"
     text = markdown(measured.tables)
     assert "### tiny: mean over seeds (range)" in text
     assert all(f"| {label} |" in text for label in ("small", "alone", RULE, "always irrelevant"))

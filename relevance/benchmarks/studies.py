@@ -21,6 +21,7 @@ from relevance.metrics import (
     average_precision,
     bootstrap,
     ratio_of_sums,
+    recall_at,
 )
 from relevance.report import curves
 from relevance.report.paper import Queries, paper
@@ -33,6 +34,9 @@ EVERY, CLEAR = "all goals", "goals with one answer"
 """Which goals are judged; the second leaves the ambiguous ones out."""
 STANDS = ("on the subject", "on the reference", "elsewhere")
 """Where a query stands."""
+BOXES = {"3 to 10": (3, 10), "11 to 17": (11, 17), "18 to 22": (18, 22), "23 to 27": (23, 27),
+         "28 to 31": (28, 31)}  # fmt: skip
+"""Scenes by their number of boxes."""
 
 Row = Mapping[str, Any]
 
@@ -50,6 +54,8 @@ class Scored:
     """Where the queries stand; anywhere when empty."""
     goals: str
     """Which goals are judged."""
+    boxes: str
+    """How many boxes the scenes have; any number when empty."""
     body: str
     reading: str
     recipe: str
@@ -79,6 +85,8 @@ class Scored:
     """The total at the paper's share of relevant queries."""
     balanced: float
     average_precision: float
+    recall: float
+    """Of the relevant ones, the share kept where 95% of the irrelevant ones are left out."""
     tasks_right: float
     """Share of goals of which every query is judged rightly."""
 
@@ -104,6 +112,7 @@ def tabulate(
             _means_table(study, scored, pooled),
             _predicates_table(study, scored),
             _stands_table(study, scored),
+            _boxes_table(study, scored),
         ),
         plots=tuple(_plots(study, rows, scored)),
     )
@@ -129,10 +138,14 @@ def _judged(row: Row, part: Predictions, group: str, judge: str) -> Iterator[Sco
         rows = part.where(part.stands == stands)
         if len(rows):
             yield _figures(row, rows, group, judge, EVERY, stands)
+    for boxes, (least, most) in BOXES.items() if group in GROUPS else ():
+        rows = part.where((part.n_objects >= least) & (part.n_objects <= most))
+        if len(rows):
+            yield _figures(row, rows, group, judge, EVERY, "", boxes)
 
 
 def _figures(
-    row: Row, part: Predictions, group: str, judge: str, goals: str, stands: str
+    row: Row, part: Predictions, group: str, judge: str, goals: str, stands: str, boxes: str = ""
 ) -> Scored:
     score = JUDGES[judge](part)
     found = Accuracy.of(score, part.relevant, task=part.task)
@@ -155,7 +168,7 @@ def _figures(
         "of_paper": _of_paper(asked, group),
     }
     learned: dict[str, Any] = {name: value if network else None for name, value in took.items()}
-    theirs = None if stands else paper().test.get(group)
+    theirs = None if stands or boxes else paper().test.get(group)
     return Scored(
         label=row["label"] if network else judge,
         run=row["run"] if network else judge,
@@ -163,6 +176,7 @@ def _figures(
         group=group,
         stands=stands,
         goals=goals,
+        boxes=boxes,
         **about,
         **learned,
         queries=found.n_rows,
@@ -175,6 +189,7 @@ def _figures(
         total_at_paper=None if theirs is None else at_share(found, theirs),
         balanced=found.balanced,
         average_precision=average_precision(score, part.relevant),
+        recall=recall_at(score, part.relevant),
         tasks_right=found.tasks_right,
     )
 
@@ -287,7 +302,7 @@ def _means_table(
 
 
 def _predicates_table(study: str, scored: Sequence[Scored]) -> Table:
-    rows = [one for one in scored if one.goals == EVERY and not one.stands]
+    rows = [one for one in scored if one.goals == EVERY and not one.stands and not one.boxes]
     rows = [one for one in rows if one.group in PREDICATES]
     names = ("true_relevant", "true_irrelevant", "total", "total_at_paper", "base_rate")
     return Table(
@@ -323,9 +338,29 @@ def _stands_table(study: str, scored: Sequence[Scored]) -> Table:
     )  # fmt: skip
 
 
+def _boxes_table(study: str, scored: Sequence[Scored]) -> Table:
+    names = ("true_relevant", "true_irrelevant", "total", "recall", "base_rate", "balanced")
+    rows = []
+    for boxes in BOXES:
+        some = [one for one in scored if one.boxes == boxes]
+        for (family, label), runs in _together(some).items():
+            figures = (_mean([getattr(one, name) for one in runs]) for name in names)
+            rows.append((family, boxes, label, len(runs), runs[0].queries, *figures))
+    return Table(
+        name="boxes",
+        title=f"{study}: by the number of boxes, mean over seeds (range), %",
+        columns=(
+            "scenes of", "boxes", "what", "runs", "queries", "true relevant", "true irrelevant",
+            "total", "true relevant at 95 true irrelevant", "base rate", "balanced",
+        ),
+        rows=tuple(rows),
+    )  # fmt: skip
+
+
 def _of_families(scored: Sequence[Scored]) -> list[Scored]:
     """The rows of whole families, family by family, the rules first."""
-    some = [s for s in scored if s.group in GROUPS and s.goals == EVERY and not s.stands]
+    some = [s for s in scored if s.group in GROUPS and s.goals == EVERY]
+    some = [s for s in some if not s.stands and not s.boxes]
     return sorted(some, key=lambda one: (GROUPS.index(one.group), one.judge == NETWORK))
 
 
