@@ -6,6 +6,7 @@ import hashlib
 import os
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -119,6 +120,27 @@ def test_an_object_store_holds_the_same_bytes(bucket: str, calm: Path) -> None:
     assert [of.policy for of in Dataset.open(root).labellings()] == ["any-minimal"]
     _, [(n, m)] = sql(root, "select (select count(*) from labels), count(*) from beside_labels")
     assert n == m > 0
+
+
+@pytest.mark.slow  # a server of objects
+def test_queries_do_not_ask_again_what_is_there(
+    bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, asked = f"{bucket}/asked", Counter[str]()
+    locate(root).fs.put(str(ruled()), root, recursive=True)  # type: ignore[attr-defined]
+    store = pytest.importorskip("s3fs").S3FileSystem
+    plain = store._call_s3
+
+    async def counted(self: Any, method: str, *args: Any, **named: Any) -> Any:
+        asked[method] += 1
+        return await plain(self, method, *args, **named)
+
+    with Dataset.open(root).connect(names=("labels",)) as connection:
+        monkeypatch.setattr(store, "_call_s3", counted)
+        first = connection.execute("select count(*), count(distinct query) from labels").fetchall()
+        assert first == sql(ruled(), "select count(*), count(distinct query) from labels")[1]
+    assert asked["get_object"] > 0
+    assert set(asked) == {"get_object"}, "no file is asked about again"
 
 
 @pytest.mark.slow  # a server of objects

@@ -7,7 +7,7 @@ Every figure names the number of tasks that it rests on.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,8 @@ from checkpoints c order by created desc, checkpoint_id
 
 
 def _page(dataset: Dataset, checkpoint_id: str | None, examples: int) -> dict[str, Any]:
-    chosen = _choose(dataset, _ask(dataset, None)(_CHECKPOINTS), checkpoint_id)
+    known = _ask(dataset, None, ("checkpoints", "predictions", "evaluations"))(_CHECKPOINTS)
+    chosen = _choose(dataset, known, checkpoint_id)
     own = dataset.labelling.policy if dataset.labelling else None
     policy = policy_of_checkpoint(dataset, chosen) if chosen else own
     rows = _ask(dataset, policy if policy != own else None)
@@ -61,7 +62,7 @@ def _page(dataset: Dataset, checkpoint_id: str | None, examples: int) -> dict[st
     guided = guided_section(dataset, chosen)
     tasks = choose_examples(rows, chosen, missed=guided["misses"], per_predicate=examples)
     pictures = draw_examples(dataset, tasks)
-    model = network_section(dataset, rows(_CHECKPOINTS), chosen)
+    model = network_section(dataset, known, chosen)
     return {
         "name": dataset.path.resolve().name,
         "made": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -82,9 +83,9 @@ def _page(dataset: Dataset, checkpoint_id: str | None, examples: int) -> dict[st
     }
 
 
-def _ask(dataset: Dataset, policy: str | None) -> Rows:
-    """A function that asks the dataset's views, its labels being those of `policy`."""
-    connection = dataset.connect(policy=policy)
+def _ask(dataset: Dataset, policy: str | None, names: Collection[str] | None = None) -> Rows:
+    """A function that asks the dataset's views, all or some, its labels being those of `policy`."""
+    connection = dataset.connect(policy=policy, names=names)
 
     def rows(query: str, *values: Any) -> list[dict[str, Any]]:
         found = connection.execute(query, list(values))

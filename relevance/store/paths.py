@@ -76,6 +76,15 @@ def filesystem(path: Path) -> Any:
     return cast(Any, path).fs
 
 
+def listed(path: Path) -> Any:
+    """The same of its own, which has listed the folder once and asks no more what is there."""
+    its = filesystem(path)
+    known = {**its.storage_options, "use_listings_cache": True, "skip_instance_cache": True}
+    own = type(its)(*its.storage_args, **known)
+    own.find(cast(Any, path).path)
+    return own
+
+
 def absolute(path: str | Path) -> Path:
     """The located path, made absolute when it is local."""
     there = locate(path)

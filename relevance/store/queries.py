@@ -12,7 +12,7 @@ import duckdb
 from relevance.store import compacting, labellings
 from relevance.store.files import Files
 from relevance.store.needs import everything, needs, views
-from relevance.store.paths import DatasetError, filesystem, is_remote
+from relevance.store.paths import DatasetError, is_remote, listed
 from relevance.store.scans import nothing, scans
 from relevance.store.tables import TABLES, one_line, table_schema
 
@@ -52,7 +52,8 @@ def connect(
     connection = duckdb.connect()
     connection.execute("SET enable_progress_bar = false")
     if is_remote(dataset.path):
-        connection.register_filesystem(filesystem(dataset.path))
+        # each file is opened for each query: without a listing it would be asked about each time
+        connection.register_filesystem(listed(dataset.path))
     for name, body in bodies.items():
         try:
             connection.execute(f"CREATE {'TABLE' if memory else 'VIEW'} {name} AS {body}")

@@ -120,11 +120,10 @@ def _bodies() -> Iterator[Run]:
         yield from _runs(body, "bare")
     for body in BODIES:  # of same-plane alone the paper says nothing
         yield from (r for r in _runs(body, "fair, alone", seeds=2) if r.config.families == ("on",))
-    for body in ("vit", "glimpse"):
-        for run in _runs(body, "fair"):
-            for polling in ("turns", "rounds", "one-by-one"):
-                config = replace(run.config, polling=polling, share_encodings=False)
-                yield replace(run, label=f"{body} {polling}", config=config, curve="polling")
+    for run in _runs("vit", "fair"):
+        for polling in ("turns", "rounds", "one-by-one"):
+            config = replace(run.config, polling=polling, share_encodings=False)
+            yield replace(run, label=f"vit {polling}", config=config, curve="polling")
 
 
 def _data() -> Iterator[Run]:
