@@ -217,13 +217,15 @@ def test_studies_hold_what_they_are_for() -> None:
 
 @pytest.fixture
 def tiny() -> Generator[str]:
-    """A study of three runs, two of them alike but for the seed."""
+    """Four runs: two are alike but for the seed, two share a label, each with scenes of its own."""
     run = Run(label="small", recipe="smoke", config=CONFIG, curve="smoke")
     alone = replace(CONFIG, predicates=("on",), families=("on",))
+    other = replace(CONFIG, predicates=("behind",), families=("same-plane",))
     runs = [
         run,
         replace(run, config=replace(CONFIG, seed=1)),
         replace(run, label="alone", config=alone),
+        replace(run, label="alone", config=other),
     ]
     name = "tiny"
     STUDIES.register(name, Study(about="tests", minutes=1e-4, runs=lambda: iter(runs)))
@@ -284,13 +286,13 @@ def test_a_killed_study_ends_with_the_same_table(tiny: str, tmp_path: Path) -> N
         tables.append(without_times(rows))
     assert tables[0] == tables[1]
     assert [row["run"] for row in tables[0]] == [
-        "small, seed 0", "small, seed 1", "alone, on, seed 0",
+        "small, seed 0", "small, seed 1", "alone, on, seed 0", "alone, same-plane, seed 0",
     ]  # fmt: skip
 
 
 def test_predictions_that_were_lost_are_made_again(tiny: str, tmp_path: Path) -> None:
     root = copied(tmp_path, of=small_dataset)
-    plan = Plan.of(root, tiny, folder=tmp_path / "out", only=("alone",))
+    plan = Plan.of(root, tiny, folder=tmp_path / "out", only=("alone, on",))
     [row] = run_study(plan, pooled=here(), told=lambda line: None)
     folder = root / "predictions"
     shutil.rmtree(folder)

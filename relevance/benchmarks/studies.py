@@ -100,8 +100,8 @@ def tabulate(
         queries = read_predictions(dataset, row["checkpoint_id"]).queries()
         scored += list(_scored(row, queries, {one.group for one in scored}))
         for family in GROUPS:
-            sums = _by_scene(queries.of(family))
-            pooled.setdefault((row["label"], family), []).append(sums)
+            if len(part := queries.of(family)):  # networks of other families share the label
+                pooled.setdefault((row["label"], family), []).append(_by_scene(part))
         if progress:
             progress(number, len(rows))
     return Measured(
