@@ -5,7 +5,7 @@ Shares are of queries (subject and reference left out) at beta = 0, which is wha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -320,41 +320,46 @@ def _predicates_table(study: str, scored: Sequence[Scored]) -> Table:
 
 
 def _stands_table(study: str, scored: Sequence[Scored]) -> Table:
-    names = ("true_relevant", "true_irrelevant", "total", "base_rate", "balanced")
-    rows = []
-    for stands in STANDS:
-        some = [one for one in scored if one.stands == stands and one.group in GROUPS]
-        for (family, label), runs in _together(some).items():
-            figures = (_mean([getattr(one, name) for one in runs]) for name in names)
-            rows.append((family, stands, label, len(runs), runs[0].queries, *figures))
-    return Table(
-        name="stands",
-        title=f"{study}: by where the query stands, mean over seeds (range), %",
-        columns=(
-            "scenes of", "the query stands", "what", "runs", "queries", "true relevant",
-            "true irrelevant", "total", "base rate", "balanced",
-        ),
-        rows=tuple(rows),
-    )  # fmt: skip
+    figures = {
+        "true relevant": "true_relevant", "true irrelevant": "true_irrelevant", "total": "total",
+        "base rate": "base_rate", "balanced": "balanced",
+    }  # fmt: skip
+    head = ("stands", f"{study}: by where the query stands", "the query stands")
+    return _parts_table(scored, *head, STANDS, lambda one: one.stands, figures)
 
 
 def _boxes_table(study: str, scored: Sequence[Scored]) -> Table:
-    names = ("true_relevant", "true_irrelevant", "total", "recall", "base_rate", "balanced")
+    figures = {
+        "true relevant": "true_relevant", "true irrelevant": "true_irrelevant", "total": "total",
+        "true relevant at 95 true irrelevant": "recall", "base rate": "base_rate",
+        "balanced": "balanced",
+    }  # fmt: skip
+    head = ("boxes", f"{study}: by the number of boxes", "boxes")
+    return _parts_table(scored, *head, BOXES, lambda one: one.boxes, figures)
+
+
+def _parts_table(
+    scored: Sequence[Scored],
+    name: str,
+    title: str,
+    column: str,
+    parts: Iterable[str],
+    of: Callable[[Scored], str],
+    figures: Mapping[str, str],
+) -> Table:
+    """Families divided into parts; `figures` names columns and what of a run they show."""
     rows = []
-    for boxes in BOXES:
-        some = [one for one in scored if one.boxes == boxes]
+    for part in parts:
+        some = [one for one in scored if of(one) == part and one.group in GROUPS]
         for (family, label), runs in _together(some).items():
-            figures = (_mean([getattr(one, name) for one in runs]) for name in names)
-            rows.append((family, boxes, label, len(runs), runs[0].queries, *figures))
+            means = (_mean([getattr(one, figure) for one in runs]) for figure in figures.values())
+            rows.append((family, part, label, len(runs), runs[0].queries, *means))
     return Table(
-        name="boxes",
-        title=f"{study}: by the number of boxes, mean over seeds (range), %",
-        columns=(
-            "scenes of", "boxes", "what", "runs", "queries", "true relevant", "true irrelevant",
-            "total", "true relevant at 95 true irrelevant", "base rate", "balanced",
-        ),
+        name=name,
+        title=f"{title}, mean over seeds (range), %",
+        columns=("scenes of", column, "what", "runs", "queries", *figures),
         rows=tuple(rows),
-    )  # fmt: skip
+    )
 
 
 def _of_families(scored: Sequence[Scored]) -> list[Scored]:
