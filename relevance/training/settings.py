@@ -101,7 +101,8 @@ class TrainConfig:
     """Where several sets tie, learn of each object the share of them that it is in, instead of
     the one that was found (policy `found`)."""
     bfloat16: Literal["auto", "on", "off"] = "auto"
-    """Autocast; auto: only on processors that multiply bfloat16 (others emulate it slowly)."""
+    """Autocast; auto: only on an accelerator that has it. On processors, some of which have it and
+    some of which emulate it slowly, the same settings then learn the same."""
     device: str = execution("auto")
     """Where: auto is the accelerator if there is one; else as torch names them, e.g. cuda:1."""
     threads: Annotated[int, Field(ge=0)] = execution(0)

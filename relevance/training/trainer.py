@@ -210,13 +210,10 @@ def trained_predicates(predicates: Sequence[Predicate], config: TrainConfig) -> 
 
 
 def use_bfloat16(choice: str, device: torch.device) -> bool:
-    """Whether to autocast: `auto` asks the processor for native bfloat16 arithmetic."""
+    """Whether to autocast; `auto`: on an accelerator that has bfloat16."""
     if choice != "auto":
         return choice == "on"
-    if device.type == "cuda":
-        return torch.cuda.is_bf16_supported()
-    flags = torch.cpu.get_capabilities()
-    return any(flags.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+    return device.type == "cuda" and torch.cuda.is_bf16_supported()
 
 
 def train(
