@@ -106,6 +106,8 @@ class Encoding:
     """(B, N) bool; False for padding."""
     geometry: Tensor | None = None
     """(B, N, GEOMETRY) estimated or given geometry, decimetres (glimpse, geometry)."""
+    between: Tensor | None = None
+    """(B, N, N, E) what lies between every two objects, row from column (the same two)."""
     scene: Tensor | None = None
     """(B, ...) what was seen of the scene apart from its objects, for bodies that look at a
     subject, a reference and a query together."""

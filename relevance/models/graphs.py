@@ -20,7 +20,7 @@ from relevance.networks import GEOMETRY, WEIGHTS, label
 from relevance.scene import PREDICATES
 
 _OPSET = 20
-_SEEN = ("tokens", "geometry", "scene")
+_SEEN = ("tokens", "geometry", "between", "scene")
 
 
 class _Encoder(nn.Module):
@@ -59,6 +59,7 @@ class _Decoder(nn.Module):
             tokens=tokens,
             present=present,
             geometry=parts.get("geometry"),
+            between=parts.get("between"),
             scene=parts.get("scene"),
         )
         return self.body.decode(encoding, self.predicate, goals[None], asked).scores[0]
@@ -88,6 +89,7 @@ def _graphs(config: ModelConfig, predicates: tuple[str, ...]) -> tuple[tuple[str
             "views": torch.zeros(objects, 3, PATCH, PATCH, dtype=torch.uint8),
         }
     varies = {"views": {0: "N"}, "poses": {0: "N"}, "tokens": {1: "N"}, "geometry": {1: "N"}}
+    varies["between"] = {1: "N", 2: "N"}
     with torch.no_grad():
         encoder = _Encoder(model)
         found = encoder(*given.values())

@@ -74,18 +74,17 @@ class Reasoning(nn.Module):
             Attention(width, heads, expansion=2, between=BETWEEN) for _ in range(layers)
         )
 
-    def forward(
-        self, tokens: Tensor, present: Tensor, geometry: Tensor, predicate: Predicate, goals: Tensor
-    ) -> Tensor:
-        """Tokens (B, G, N, D) from tokens (B, N, D) and geometry (B, N, GEOMETRY)."""
-        features = goal_features(geometry, predicate, goals)
-        x_BGND = tokens[:, None] + self.place(features) + self.predicate[predicate.name]
+    def forward(self, encoding: Encoding, predicate: Predicate, goals: Tensor) -> Tensor:
+        """Tokens (B, G, N, D) from what is known of a scene and its objects."""
+        assert encoding.geometry is not None
+        features = goal_features(encoding.geometry, predicate, goals)
+        x_BGND = encoding.tokens[:, None] + self.place(features) + self.predicate[predicate.name]
         x = x_BGND[0] if tracing() else x_BGND.flatten(0, 1)
-        allowed, between = columns(present), self.between(geometry)
+        allowed = columns(encoding.present)
         if allowed is not None:
             allowed = allowed.repeat_interleave(goals.shape[1], dim=0)
         for layer in self.layers:
-            x = layer(x, allowed, between)
+            x = layer(x, allowed, encoding.between)
         return x[None] if tracing() else x.view(x_BGND.shape)
 
 
@@ -109,14 +108,14 @@ class Thinker(Body):
     def thought(self, tokens: Tensor, present: Tensor, geometry: Tensor) -> Encoding:
         """What is known of each object, tokens (B, N, D), and where it is, (B, N, GEOMETRY)."""
         tokens = self.among(tokens, columns(present))
-        return Encoding(tokens=tokens, present=present, geometry=geometry)
+        between = self.reason.between(geometry)  # the same for all goals of the scene
+        return Encoding(tokens=tokens, present=present, geometry=geometry, between=between)
 
     def decode(
         self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor
     ) -> Answer:
         """As `RelevanceModel.answer`."""
-        assert encoding.geometry is not None
-        x = self.reason(encoding.tokens, encoding.present, encoding.geometry, predicate, goals)
+        x = self.reason(encoding, predicate, goals)
         return Answer(scores=self.heads[predicate.name](x).squeeze(-1))
 
 

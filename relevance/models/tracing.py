@@ -10,6 +10,7 @@ K whatever.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -86,3 +87,28 @@ class _Attention(torch.autograd.Function):
 def attend(x_BLD: Tensor, qkv: nn.Linear, heads: int) -> Tensor:
     """What `scaled_dot_product_attention` makes of x with these projections, (B, L, D)."""
     return _Attention.apply(x_BLD, qkv.weight, qkv.bias, heads)  # pyright: ignore
+
+
+class _Reshaped(torch.autograd.Function):
+    """As `reshaped`."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, sizes: tuple[int, ...]) -> Tensor:
+        return x.reshape([size or x.shape[i] for i, size in enumerate(sizes)])
+
+    @staticmethod
+    def symbolic(g: Any, x: Any, sizes: tuple[int, ...]) -> Any:
+        return g.op("Reshape", x, g.op("Constant", value_t=torch.tensor(sizes)))
+
+
+def reshaped(x: Tensor, sizes: tuple[int, ...]) -> Tensor:
+    """x in another shape; 0 keeps a size: torch's own asks for each and puts them together."""
+    return _Reshaped.apply(x, sizes)  # pyright: ignore
+
+
+def shares(x_BLD: Tensor, qkv: nn.Linear, heads: int, say_1HLL: Tensor) -> tuple[Tensor, Tensor]:
+    """Who looks at whom, (B, heads, L, L), given a say in it, and what is seen so, (B, L, D)."""
+    each = qkv.in_features // heads
+    q, k, v = reshaped(qkv(x_BLD), (0, -1, 3, heads, each)).permute(2, 0, 3, 1, 4)
+    share = (q @ k.transpose(2, 3) / math.sqrt(each) + say_1HLL).softmax(-1)
+    return share, reshaped((share @ v).transpose(1, 2), (0, 0, -1))
