@@ -6,8 +6,10 @@ reason in NOT_RUN; each other block is Python that runs, a scene that is read, o
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -175,8 +177,12 @@ def _run(arguments: list[str], project: Path, where: str) -> None:
 def _shell(block: Block, project: Path, *, slow: bool) -> None:
     for command in commands(block.text):
         if reason(command) is None and (slow or not re.search(SLOW, command)):
-            line = _filled(command, project)
-            _run(["bash", "-c", line], project, f"{block.page}:{block.line}")
+            line, where = _filled(command, project), f"{block.page}:{block.line}"
+            if slow or re.search(r"[|<>&;$*]", line):
+                _run(["bash", "-c", line], project, where)
+            else:  # a second or two less for each
+                with contextlib.chdir(project):
+                    assert main(shlex.split(line)[1:]) == 0, f"{where}: {line}"
 
 
 def test_quick_lines_and_python_run(project: Path) -> None:

@@ -152,6 +152,7 @@ def test_solves_the_scene_that_needs_another_hold():
     assert blocking(scene, scene.goal("on(b0, b1)"), CLEARANCE) == ("b2",)
 
 
+@pytest.mark.slow
 def test_more_clearance_never_makes_a_task_easier():
     for task in draw(8, 5, boxes=(3, 5)):
         low, high = (shortest(task.scene, task.goal, c) for c in (CLEARANCE, 0.01))

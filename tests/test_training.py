@@ -254,7 +254,10 @@ def test_each_scene_is_encoded_once_for_all_goals_and_predicates(
     assert len(batch.turns) == 4
 
 
-@pytest.mark.parametrize("body", list(SMALL))
+@pytest.mark.parametrize(
+    "body",
+    [body if body == "glimpse" else pytest.param(body, marks=pytest.mark.slow) for body in SMALL],
+)
 def test_a_network_learns_a_few_scenes_by_heart(made: Path, body: str) -> None:
     model = SMALL[body]
     config = replace(

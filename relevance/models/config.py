@@ -1,7 +1,7 @@
 """What every body has in common: settings, the size of pictures, and what seeing a scene gives.
 
 Shape suffixes: B scenes, N objects (padded), G goals, T queries, K looks, P cells of a
-grid over the image, D width.
+grid over the image, D width, E what lies between two objects.
 """
 
 from __future__ import annotations

@@ -106,9 +106,12 @@ def reshaped(x: Tensor, sizes: tuple[int, ...]) -> Tensor:
     return _Reshaped.apply(x, sizes)  # pyright: ignore
 
 
-def shares(x_BLD: Tensor, qkv: nn.Linear, heads: int, say_1HLL: Tensor) -> tuple[Tensor, Tensor]:
-    """Who looks at whom, (B, heads, L, L), given a say in it, and what is seen so, (B, L, D)."""
+def shares(x_BLD: Tensor, qkv: nn.Linear, heads: int, say: Tensor) -> tuple[Tensor, Tensor]:
+    """Who looks at whom, (B, heads, L, L), and what is seen so, (B, L, D).
+
+    `say` (1, heads, L, L) is added to the logits.
+    """
     each = qkv.in_features // heads
     q, k, v = reshaped(qkv(x_BLD), (0, -1, 3, heads, each)).permute(2, 0, 3, 1, 4)
-    share = (q @ k.transpose(2, 3) / math.sqrt(each) + say_1HLL).softmax(-1)
+    share = (q @ k.transpose(2, 3) / math.sqrt(each) + say).softmax(-1)
     return share, reshaped((share @ v).transpose(1, 2), (0, 0, -1))

@@ -20,7 +20,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 
 from relevance.configs import first_error
-from relevance.networks.files import named, shipped
+from relevance.networks.files import named, read_checkpoint, shipped
 from relevance.store import Dataset, DatasetError, is_remote, locate, replacing
 
 CHAMPION = "champion"
@@ -217,7 +217,8 @@ def meant(dataset: Dataset) -> str | None:
 
 
 def find_checkpoint(root: str | Path, text: str | Path | None = None) -> Path:
-    """The file that is meant by an id of the dataset, a path, `champion`, or nothing: see `meant`.
+    """The file that is meant by an id of the dataset or of a model of the package, a path,
+    `champion`, or nothing: see `meant`.
 
     Raises DatasetError with the ids that there are.
     """
@@ -240,6 +241,9 @@ def find_checkpoint(root: str | Path, text: str | Path | None = None) -> Path:
     path = named(name)
     if path.is_file():
         return path
+    for path in shipped().values():
+        if read_checkpoint(path).meta["checkpoint_id"] == name:
+            return path
     raise DatasetError(
         f"{dataset.path}: unknown checkpoint {name!r}, expected a file or one of {known}"
     )

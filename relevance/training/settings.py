@@ -61,8 +61,8 @@ class TrainConfig:
     """Id of a checkpoint of the dataset whose weights are taken over and stay as they are: only
     heads that it lacks are trained, those of `predicates`."""
     continues: str = ""
-    """Id of a checkpoint of the dataset, of the same body and heads, whose weights training goes
-    on from."""
+    """Id of a checkpoint of the dataset or of a model of the package, of the same body and heads,
+    whose weights training goes on from."""
     polling: Literal["turns", "rounds", "one-by-one"] = "turns"
     """turns: one predicate's batch a step, in rotation; rounds: a batch of each in every step;
     one-by-one: each predicate for its share of the steps, the next begins when it is done."""

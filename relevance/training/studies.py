@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from relevance.models import BODIES
+from relevance.networks import read_checkpoint, shipped
 from relevance.registry import Registry
 from relevance.scene import PREDICATES
 from relevance.training.settings import TrainConfig
@@ -160,8 +161,16 @@ def _ship() -> Iterator[Run]:
 
 
 def _crowd() -> Iterator[Run]:
-    yield from (replace(run, ship="crowd") for run in _runs("glimpse", "long"))
-    yield from _runs("geometry", "long")
+    for body in ("glimpse", "geometry"):
+        yield from _runs(body, "long")
+        onward = read_checkpoint(shipped()[body]).meta["checkpoint_id"]
+        for run in _runs(body, "long"):
+            yield replace(
+                run,
+                label=f"{body} long, on from the package's",
+                config=replace(run.config, continues=onward),
+                ship="crowd" if body == "glimpse" else "",
+            )
 
 
 STUDIES = Registry[Study]("study")

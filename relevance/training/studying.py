@@ -199,7 +199,13 @@ def _steps(
 def _alike(plan: Plan, named: Callable[[TrainConfig], str], run: Run) -> str:
     """The same for settings of which a step costs the same."""
     alike = replace(
-        run.config, steps=1, seed=0, goal_objects=True, soft_labels=False, scene_share=1.0
+        run.config,
+        steps=1,
+        seed=0,
+        continues="",
+        goal_objects=True,
+        soft_labels=False,
+        scene_share=1.0,
     )
     return f"{named(alike)} in {plan.seconds(run):g} s, {plan.device}"
 
