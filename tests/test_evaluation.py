@@ -27,6 +27,7 @@ from relevance.evaluation import (
     compare,
     evaluate,
     left_out,
+    limits,
     load_guide,
     load_scorer,
     predict,
@@ -35,6 +36,7 @@ from relevance.evaluation import (
     unjudged,
 )
 from relevance.models import BODIES, RelevanceModel
+from relevance.pipeline import Counts, DatasetConfig, prepare
 from relevance.planner import GUIDES, PlannerConfig, plan
 from relevance.report import page
 from relevance.scene import Box, Camera, Goal, Scene
@@ -568,6 +570,15 @@ def test_shards_one_by_one_make_the_rows_of_all_at_once(tmp_path) -> None:
     for shard in reversed(dataset.shards("test")):
         evaluate(root, checkpoint, EVALUATION, shards=[shard])
     assert rows() == before
+
+
+def test_a_dataset_is_asked_for_plans_as_long_as_its_own(tmp_path) -> None:
+    own = PlannerConfig(max_actions=2, node_limit=77)
+    prepare(tmp_path, DatasetConfig(test=Counts(on=1), planner=own))
+    dataset = Dataset.open(tmp_path)
+    assert limits(dataset, PlannerConfig()) == own
+    asked = PlannerConfig(max_actions=4)
+    assert limits(dataset, asked) == asked
 
 
 def test_tasks_are_drawn_by_their_id_alone() -> None:

@@ -51,6 +51,7 @@ from relevance.evaluation.reruns import (
     choose_tasks,
     compare,
     evaluate,
+    limits,
 )
 from relevance.evaluation.scorer import (
     EvaluationError,
@@ -117,6 +118,7 @@ __all__ = [
     "guided_cost",
     "in_group",
     "left_out",
+    "limits",
     "load_guide",
     "load_scorer",
     "look_at",

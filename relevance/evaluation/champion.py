@@ -30,10 +30,10 @@ from relevance.evaluation.predictions import (
     predict,
     unjudged,
 )
+from relevance.evaluation.reruns import settings_of
 from relevance.evaluation.scorer import EvaluationError, NetworkScorer, load_scorer
 from relevance.metrics import Interval, bootstrap, ratio_of_sums
 from relevance.networks import Learned, find_checkpoint, read_record, settle
-from relevance.pipeline import load_config
 from relevance.planner import GUIDES, Guide, PlannerConfig, plan
 from relevance.sampling import SAMPLER_VERSION, SceneConfig, sample_task
 from relevance.scene import PREDICATES, Goal, Scene
@@ -181,7 +181,7 @@ def _trial(
             contender=name, champion=standing, change=None, work=nothing, boxes=config.boxes,
             lacking=lacking,
         )  # fmt: skip
-    planner = load_config(_first(dataset)).planner
+    planner = settings_of(dataset).planner
     if GUIDES[config.guide].first:  # then no guide, too, is done with its first plan
         planner = replace(planner, stop="first")
     guides = [
@@ -209,7 +209,7 @@ def fresh_tasks(
     They depend on the scenes' settings, the predicates and `config` alone; more tasks keep the
     earlier ones. Raises EvaluationError for more boxes than its scenes can hold.
     """
-    scenes: SceneConfig = load_config(_first(dataset)).scene
+    scenes: SceneConfig = settings_of(dataset).scene
     seed = int(identity_hash([scenes, config.boxes], sampler=SAMPLER_VERSION)[:15], 16)
     chosen = [predicate for name, predicate in PREDICATES.items() if name in predicates]
     tasks = []
@@ -223,11 +223,6 @@ def fresh_tasks(
             )
         tasks.append(found)
     return tasks
-
-
-def _first(dataset: Dataset) -> Dataset:
-    """The dataset whose settings count: a merged one's first source."""
-    return Dataset.open(dataset.sources[0].dataset.path) if dataset.sources else dataset
 
 
 def _spent(

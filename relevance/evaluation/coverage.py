@@ -25,7 +25,7 @@ from relevance.evaluation.calibration import (
 )
 from relevance.evaluation.comparisons import Comparison, summarise
 from relevance.evaluation.predictions import Progress, predict
-from relevance.evaluation.reruns import EvaluationConfig, choose_tasks, compare
+from relevance.evaluation.reruns import EvaluationConfig, choose_tasks, compare, limits
 from relevance.evaluation.scorer import load_scorer, open_checkpoint
 from relevance.metrics import Interval, binomial_interval, mean
 from relevance.networks import named, read_checkpoint, write_checkpoint
@@ -163,6 +163,7 @@ def covered_speeds(
     """
     config = replace(config or EvaluationConfig.demo(), beta=0.0, betas=(), priors=())
     dataset = Dataset.open(root)
+    config = replace(config, planner=limits(dataset, config.planner))
     scorers = {level: load_scorer(checkpoint, coverage=level) for level in levels}
     calibration = read_calibration(checkpoint, levels)
     heads = tuple(calibration.needs)

@@ -20,6 +20,7 @@ from relevance.evaluation.predictions import Progress
 from relevance.evaluation.priors import PRIORS, TRUE, prior_scorer
 from relevance.evaluation.scorer import NetworkScorer, load_scorer
 from relevance.hashing import content_hash
+from relevance.pipeline import DatasetConfig, load_config
 from relevance.planner import GUIDES, PLANNER_VERSION, PlannerConfig, Scorer
 from relevance.scene import PREDICATES, Goal, Scene
 from relevance.store import Dataset
@@ -57,7 +58,8 @@ class EvaluationConfig:
     searches: Annotated[tuple[Literal["tree", "informed"], ...], Field(min_length=1)] = ("tree",)
     """`tree` is the paper's uninformed baseline; `informed` our own stronger one."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
-    """Limits of the search; its own `search` is overridden by each of the ones above."""
+    """Limits of the search, the dataset's own where these are the defaults; its `search` is
+    overridden by each of the ones above."""
 
     @model_validator(mode="after")
     def _guides(self) -> EvaluationConfig:
@@ -158,6 +160,7 @@ def evaluate(
     """
     config = config or EvaluationConfig.demo()
     dataset = Dataset.open(root)
+    config = replace(config, planner=limits(dataset, config.planner))
     scorer = load_scorer(checkpoint, into=dataset)
     shards = dataset.shards(config.split) if shards is None else shards
     tasks: dict[int, list[Task]] = {shard: [] for shard in shards}
@@ -185,6 +188,20 @@ def evaluate(
         dataset.write_rows("evaluations", rows, made_by={"made_by": made_by}, **where)
         count += len(rows)
     return count
+
+
+def limits(dataset: Dataset, asked: PlannerConfig) -> PlannerConfig:
+    """The limits that are asked for; those of the dataset's own plans where they are the defaults.
+
+    So a dataset of plans of twelve actions is not asked for six of them.
+    """
+    return settings_of(dataset).planner if asked == PlannerConfig() else asked
+
+
+def settings_of(dataset: Dataset) -> DatasetConfig:
+    """What a dataset was made with; a merged one's first source."""
+    first = dataset.sources[0].dataset.path if dataset.sources else None
+    return load_config(Dataset.open(first) if first else dataset)
 
 
 def hash_of(config: EvaluationConfig) -> str:

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from relevance.configs import config
 from relevance.evaluation.predictions import Progress
-from relevance.evaluation.reruns import choose_tasks
+from relevance.evaluation.reruns import choose_tasks, limits
 from relevance.evaluation.scorer import EvaluationError, NetworkScorer, load_scorer
 from relevance.networks import named, read_checkpoint, write_checkpoint
 from relevance.planner import Guide, PlannerConfig, plan
@@ -50,7 +50,8 @@ class TuningConfig:
     price: Annotated[int, Field(ge=0)] | None = None
     """Work that one look costs; by what the network takes, and the number of boxes, when empty."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
-    """Limits of the search; its own `search` is overridden by each of the ones above."""
+    """Limits of the search, the dataset's own where these are the defaults; its `search` is
+    overridden by each of the ones above."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,6 +101,7 @@ def tune(
     total = {
         patience: Patience(patience=patience, work=0, looks=0) for patience in config.patiences
     }
+    own = limits(dataset, config.planner)
     unguided = done = 0
     for sample in dataset.samples(config.split, sorted({task.shard for task in tasks})):
         for task in tasks:
@@ -107,7 +109,7 @@ def tune(
                 continue
             scorer.observe(sample.scene, sample.image, sample.views)
             for search in config.searches:
-                planner = replace(config.planner, search=search, stop="first")
+                planner = replace(own, search=search, stop="first")
                 plain, found = costs(sample.scene, task.goal, scorer, planner, config)
                 unguided += plain
                 for one in found:
