@@ -56,7 +56,8 @@ def _guides(_: Preset) -> Callable[..., int]:
             tasks: How many tasks of each size.
             goals: Most goals of a scene; the look is given alone and shared by them.
             sizes: Numbers of boxes.
-            priors: Who scores the objects: models of the package (glimpse, geometry), files
+            priors: Who scores the objects: models of the package (glimpse, crowd,
+                geometry), files
                 (model.pt), or true, all, none, random, distance, swept. True labels are always
                 rerun.
             guides: How the scores enter the search: prune, prune-then-full, expand, order,

@@ -52,7 +52,7 @@ def _plan(_: Preset) -> Callable[..., int]:
             guide: How the scores of the checkpoint enter the search: none, prune,
                 prune-then-full, expand, order, shortest or lazy.
             checkpoint: The model that scores the objects, which a guide needs: a file, or the name
-                of one that comes with the package (glimpse, geometry).
+                of one that comes with the package (glimpse, crowd, geometry).
             beta: An object is kept when its score exceeds -beta.
             coverage: Instead of a beta, with what probability at least all relevant objects are
                 kept, e.g. 0.95; for a checkpoint that `relevance calibrate` has seen.
