@@ -57,9 +57,8 @@ def _guides(_: Preset) -> Callable[..., int]:
             goals: Most goals of a scene; the look is given alone and shared by them.
             sizes: Numbers of boxes.
             priors: Who scores the objects: models of the package (glimpse, crowd,
-                geometry), files
-                (model.pt), or true, all, none, random, distance, swept. True labels are always
-                rerun.
+                geometry), files (model.pt), or true, all, none, random, distance, swept. True
+                labels are always rerun.
             guides: How the scores enter the search: prune, prune-then-full, expand, order,
                 shortest, lazy; order and lazy when not given, of another planner prune-then-full.
             searches: The paper's breadth-first tree, our informed search, or both.
