@@ -420,7 +420,7 @@ def test_training_goes_on_from_weights_that_fit(root: Path) -> None:
 def test_the_newest_checkpoint_and_how_one_is_named(root: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no checkpoints there, expected `train` first"):
         find_checkpoint(root)
-    with pytest.raises(DatasetError, match="expected a file or one of geometry, glimpse"):
+    with pytest.raises(DatasetError, match="expected a file or one of crowd, geometry, glimpse"):
         find_checkpoint(root, "glimpse-1")
     first, second = (train(root, replace(CONFIG, steps=1, seed=seed)) for seed in (0, 1))
     assert find_checkpoint(root) == second

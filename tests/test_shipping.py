@@ -63,13 +63,16 @@ def test_trained_models_are_not_trained_again(root: Path, tmp_path: Path) -> Non
     assert steps == []
 
 
-@pytest.mark.parametrize("name", ["glimpse", "geometry"])
-def test_models_that_ship_are_found_by_name(name: str, root: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "body"), [("glimpse", "glimpse"), ("crowd", "glimpse"), ("geometry", "geometry")]
+)
+def test_models_that_ship_are_found_by_name(name: str, body: str, root: Path) -> None:
     guide = relevance.load_guide(name)
     assert isinstance(guide.scorer, NetworkScorer)
     assert isinstance(guide.scorer.model, GraphNetwork)
-    assert guide.scorer.model.body_name == name
+    assert guide.scorer.model.body_name == body
     assert find_checkpoint(root, name) == shipped()[name]
+    assert find_checkpoint(root, guide.scorer.checkpoint_id) == shipped()[name]
     assert shipped()[name].with_suffix(".md").exists()
 
 
