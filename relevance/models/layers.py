@@ -43,15 +43,14 @@ class Attention(nn.Module):
     ) -> Tensor:
         """x (B, L, D); allowed (B or 1, L, L) bool: row may look at column (None: at all); between
         (B or C, L, L, E), each for B / C rows of x that follow each other."""
-        if tracing() and allowed is None and between is None:
-            x = x + self.out(attend(self.norm_in(x), self.qkv, self.heads))
-            return x + self.mlp(self.norm_mid(x))
-        if tracing() and allowed is None and between is not None:
-            share, seen = shares(
-                self.norm_in(x), self.qkv, self.heads, self.say(between).permute(0, 3, 1, 2)
-            )
-            carried = reshaped((share.transpose(1, 2) @ between), (0, 0, -1))
-            x = x + self.out(seen) + self.carried(carried)
+        if tracing() and allowed is None:
+            if between is None:
+                x = x + self.out(attend(self.norm_in(x), self.qkv, self.heads))
+            else:
+                say = self.say(between).permute(0, 3, 1, 2)
+                share, seen = shares(self.norm_in(x), self.qkv, self.heads, say)
+                carried = reshaped(share.transpose(1, 2) @ between, (0, 0, -1))
+                x = x + self.out(seen) + self.carried(carried)
             return x + self.mlp(self.norm_mid(x))
         batch, length, width = x.shape
         qkv = self.qkv(self.norm_in(x)).view(batch, length, 3, self.heads, width // self.heads)
