@@ -138,7 +138,7 @@ def rerun(task, prior, *, u, g, look=0.0, solved=(True, True), scene="s", **more
         nodes_unguided=100, nodes_guided=10, nlps_unguided=6, nlps_guided=3,
         sequences_unguided=4, sequences=1,
         n_actions_unguided=4, n_actions_guided=4,
-        solved_unguided=solved[0], solved_guided=solved[1], truth=True, **more,
+        solved_unguided=solved[0], solved_guided=solved[1], **{"truth": True, **more},
     )  # fmt: skip
 
 
@@ -177,10 +177,28 @@ def test_figures_by_hand():
     assert [line[4] for line in limit.rows] == [2, 3, 3]
 
 
+def test_tasks_without_a_plan_count_beside():
+    none = {"solved": (False, False), "truth": False, "scene": "t"}
+    rows = [
+        rerun(0, "glimpse", u=0.010, g=0.006, look=0.002),
+        rerun(0, "true", u=0.010, g=0.002),
+        rerun(1, "glimpse", u=0.050, g=0.064, **none),
+        rerun(1, "true", u=0.050, g=0.055, **none),
+    ]
+    tables = {table.name: table for table in measured_guides(rows).tables}
+    times, every = (tables[name] for name in ("guides-times", "guides-all"))
+    line = dict(zip(times.columns, times.rows[0], strict=True))
+    assert (line["tasks (scenes)"], line["u"][:4], line["g, look in"][:3]) == ("1 (1)", "10.0", "6.0")
+    line = dict(zip(every.columns, every.rows[0], strict=True))
+    assert (line["tasks"], line["u"], line["g, look in"]) == (2, "30.0", "35.0")
+    assert (line["without a plan"], line["their u"], line["their g"]) == (1, "50.0", "64.0")
+    assert (line["solved u / g"], line["at the limit"]) == ("1 / 1", "1 / 1")
+
+
 def test_what_has_no_oracle_yet_is_left_out():
     assert figures([rerun(0, "glimpse", u=0.010, g=0.006)]) == []
     measured = measured_guides([])
-    assert [table.rows for table in measured.tables] == [()] * 4
+    assert [table.rows for table in measured.tables] == [()] * 5
 
 
 def test_the_command_writes_rows_tables_and_plots_and_goes_on(tmp_path, capsys):

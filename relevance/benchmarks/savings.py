@@ -41,7 +41,7 @@ LINES = ("-", "--", ":", "-.")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figures:
-    """What one prior and guide do to the tasks of one size, in one search; ms a task, all tasks."""
+    """What one prior and guide do to tasks of one size, in one search; ms a task."""
 
     search: str
     size: int
@@ -185,8 +185,10 @@ _OF = ("search", "boxes", "prior", "guide")
 
 
 def measured_guides(rows: Sequence[Rerun]) -> Measured:
-    """Tables and plots of what there is."""
-    found = figures(rows)
+    """Tables and plots of what there is: true labels are of tasks with a plan, so shares of what
+    they save are of these; beside them what guides do to all tasks, and to those without."""
+    found = figures([row for row in rows if row.truth])
+    every, without = figures(rows), figures([row for row in rows if not row.truth])
     searches = list(dict.fromkeys(each.search for each in found))
     plots = [
         Plot(name=f"guides-{name}", draw=draw, panels=len(searches))
@@ -199,7 +201,13 @@ def measured_guides(rows: Sequence[Rerun]) -> Measured:
     return Measured(
         name="guides",
         rows=tuple(rows),
-        tables=(times_table(found), saving_table(found), work_table(found), limit_table(rows)),
+        tables=(
+            times_table(found),
+            saving_table(found),
+            work_table(found),
+            every_table(every, without),
+            limit_table(rows),
+        ),
         plots=tuple(plots),
     )
 
@@ -223,7 +231,9 @@ def times_table(found: Sequence[Figures]) -> Table:
         *_OF, "tasks (scenes)", "u", "g, look in", "look", "g, scene encoded once", "o",
         "medians u / g / o",
     )  # fmt: skip
-    title = "CPU ms a task, means and 95% intervals over scenes; o: true labels, no look"
+    title = (
+        "CPU ms a task with a plan, means and 95% intervals over scenes; o: true labels, no look"
+    )
     return Table(name="guides-times", title=title, columns=columns, rows=tuple(lines))
 
 
@@ -246,7 +256,8 @@ def saving_table(found: Sequence[Figures]) -> Table:
         *_OF, "u / g (67%)", "95%", "of u - o, look not paid (95%)", "of u - o (95%)",
         "solved u / g / o", "at the limit", "looked",
     )  # fmt: skip
-    return Table(name="guides-saving", title="What is saved", columns=columns, rows=tuple(lines))
+    title = "What is saved, of tasks with a plan"
+    return Table(name="guides-saving", title=title, columns=columns, rows=tuple(lines))
 
 
 def work_table(found: Sequence[Figures]) -> Table:
@@ -275,10 +286,31 @@ def work_table(found: Sequence[Figures]) -> Table:
         "actions",
     )
     title = (
-        "Work a task, means of u / g / o; sequences tried until solved and actions: where all "
+        "Work a task with a plan, means of u / g / o; sequences tried until solved and actions: where all "
         "three solve"
     )
     return Table(name="guides-work", title=title, columns=columns, rows=tuple(lines))
+
+
+def every_table(every: Sequence[Figures], without: Sequence[Figures]) -> Table:
+    """What guides do to all tasks, and to those of which no plan is known."""
+    none = {_of(each): each for each in without}
+    lines = []
+    for each in every:
+        line = [*_of(each), each.tasks, f"{each.u.value:.1f}", f"{each.g.value:.1f}"]
+        line += [f"{each.gain_wide:.2f}", _three(each.solved[:2])]
+        if beside := none.get(_of(each)):
+            line += [beside.tasks, f"{beside.u.value:.1f}", f"{beside.g.value:.1f}"]
+            line += [_three(beside.limit[:2]), f"{beside.looked:.0%}"]
+        else:
+            line += [0, "-", "-", "-", "-"]
+        lines.append(tuple(line))
+    columns = (
+        *_OF, "tasks", "u", "g, look in", "u / g (95%)", "solved u / g",
+        "without a plan", "their u", "their g", "at the limit", "looked",
+    )  # fmt: skip
+    title = "CPU ms a task, all tasks, and those of which no plan is known"
+    return Table(name="guides-all", title=title, columns=columns, rows=tuple(lines))
 
 
 def limit_table(rows: Sequence[Rerun]) -> Table:

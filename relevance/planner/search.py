@@ -32,9 +32,10 @@ from relevance.planner.result import (
 )
 from relevance.scene import Box, Goal, Scene, goal_holds
 
-SHARE = 10_000
-"""Work of the first turns, of the guided attempt and of the unguided one."""
-LONGER = (2, 4)
+SHARE = 3_000
+"""Work of the first turns, of the guided attempt and of the unguided one: a set that the scores are
+sure of has begun its motion by then, and goes on with it to its end."""
+LONGER = (3, 4)
 """How much longer each later turn is, guided and unguided: the longer scores have not helped, the
 less they are trusted."""
 
@@ -148,17 +149,15 @@ class _Planning:
         return self._levels(self.config, self.everything, self.config.node_limit).run()
 
     def _likeliest(self, *, waits: bool) -> PlanResult:
-        """Best-first and unguided in turns; where the mode waits, by length alone at first."""
+        """Best-first and unguided in turns; where the mode waits, the unguided one begins."""
         assert self.guide is not None
         first, counts = replace(self.config, stop="first"), self.problem.counts
-        if waits:
-            likely = self._likely(first, dict.fromkeys(self.everything, 0.0), shortest=True)
-            result = _Turns(likely.turns(), counts).go(self.guide.patience)
-            if result is not None and (result.status == "solved" or likely.conclusive):
-                return result
-        likely = self._likely(first, self._scores(), shortest=False)
         plain = self._levels(first, self.everything, first.node_limit)
-        guided, unguided = (_Turns(attempt.turns(), counts) for attempt in (likely, plain))
+        unguided = _Turns(plain.turns(), counts)
+        if waits and (result := unguided.go(self.guide.patience)):
+            return result
+        likely = self._likely(first, self._scores(), shortest=False)
+        guided = _Turns(likely.turns(), counts)
         for turn in count():
             result = guided.go(SHARE * LONGER[0] ** turn)
             if result is None:
