@@ -44,9 +44,9 @@ class TuningConfig:
     )  # fmt: skip
     """What is saved is summed up over these."""
     patiences: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (
-        0, 1_000, 2_000, 3_000, 5_000, 7_000, 10_000, 15_000, 20_000, 30_000, 50_000,
+        1_000, 2_000, 3_000, 5_000, 7_000, 10_000, 15_000, 20_000, 30_000, 50_000,
     )  # fmt: skip
-    """Among which is chosen."""
+    """Among which is chosen. One that does not wait at all is `order`: it loses on easy tasks."""
     price: Annotated[int, Field(ge=0)] | None = None
     """Work that one look costs; by what the network takes, and the number of boxes, when empty."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
