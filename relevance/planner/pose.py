@@ -70,6 +70,8 @@ class _Blocked(NamedTuple):
     who: list[frozenset[str] | None]
     """None: out of reach."""
     sets: frozenset[frozenset[str]]
+    least: tuple[frozenset[str], ...]
+    """Of these sets, those of which no other is a part."""
     found: dict[frozenset[str], tuple[Grasp, ...]]
     """What `free` has answered."""
 
@@ -91,6 +93,7 @@ class PoseBound:
         self._close: dict[str, tuple[set[frozenset[str]], set[frozenset[str]]]] = {}
         """For objects about whose pick less than CLOSE may decide: who is in the way of each grasp
         with that much more room and reach asked for, and less."""
+        self._in_the_way: dict[str, frozenset[str]] = {}
         self._goal_poses: dict[tuple, Placement | None] = {}
         self._held: dict[tuple[tuple[Grasp, ...], float], tuple] = {}
         self._intervals: dict[float, tuple[float, float]] = {}
@@ -99,8 +102,11 @@ class PoseBound:
 
     def in_the_way(self, name: str) -> frozenset[str]:
         """Whoever blocks a pick of the object by some grasp, or stands on it."""
-        blocked = (self._blockers(name, family) for family in FAMILIES)
-        return self.problem.above[name].union(*(who for some in blocked for who in some.sets))
+        if name not in self._in_the_way:
+            blocked = (self._blockers(name, family) for family in FAMILIES)
+            who = (who for some in blocked for who in some.sets)
+            self._in_the_way[name] = self.problem.above[name].union(*who)
+        return self._in_the_way[name]
 
     def grasps(self, name: str) -> tuple[Grasp, ...]:
         """The preferred grasps with which an object can be reached where it stands at first."""
@@ -125,13 +131,12 @@ class PoseBound:
         self.problem.counts.pose += 1
         if not self.problem.above[name] <= gone:
             return False
-        found = any(
-            any(who <= gone for who in self._blockers(name, family).sets) for family in FAMILIES
-        )
+        free = gone.issuperset
+        found = any(any(map(free, self._blockers(name, family).least)) for family in FAMILIES)
         if name in self._close:
             for family in FAMILIES:
                 self._blockers(name, family)
-            surely, perhaps = (any(who <= gone for who in sets) for sets in self._close[name])
+            surely, perhaps = (any(map(free, sets)) for sets in self._close[name])
             self.problem.undecided |= surely != perhaps
         return found
 
@@ -259,7 +264,7 @@ class PoseBound:
         i, count = problem.index[name], len(problem.boxes)
         spare = self._spare_reach(problem.boxes[name], family)
         if not (spare >= -CLOSE).any():
-            return _Blocked(family, [None] * len(family), frozenset(), {})
+            return _Blocked(family, [None] * len(family), frozenset(), (), {})
         blocking = np.zeros((len(family), count), np.bool_)
         boxes, names, seen = problem.obstacles[:count], list(problem.boxes), {}
 
@@ -284,7 +289,11 @@ class PoseBound:
             more, less = self._close.setdefault(name, (before, set(before)))
             more.update(one for one in blockers(-CLOSE)[0] if one is not None)
             less.update(one for one in blockers(CLOSE)[0] if one is not None)
-        return _Blocked(family, who, sets, {})
+        least = list[frozenset[str]]()
+        for one in sorted(sets, key=len):
+            if not any(map(one.issuperset, least)):
+                least.append(one)
+        return _Blocked(family, who, sets, tuple(least), {})
 
     def _spare_reach(self, box: Box, family: Family) -> np.ndarray:
         """By how much each grasp is within reach where the box stands, (G,), m."""
