@@ -1,7 +1,8 @@
 """The planner by several ways on one task, side by side: how every comparison of guides is timed.
 
-- Paired and interleaved: all ways plan a task one right after the other in one process, who goes
-  first is rotated, so that a warm cache or a busy machine favours nobody.
+- Paired and interleaved: all ways plan a task one right after the other in one process, in an
+  order that is drawn for each task: a busy machine favours nobody, nor does who comes before (a
+  network that looks leaves cold caches behind).
 - Equal stops: a guide whose first plan counts stands beside an unguided search of which the first
   plan counts, every other one beside an unguided search that stops as it does.
 - All of it counts: guided time includes the network and every fallback. The scene is encoded anew
@@ -133,8 +134,8 @@ def side_by_side(
 ) -> list[Pair]:
     """Plan a task unguided and in every way that is asked for; one pair a way, in their order.
 
-    `turn` rotates who goes first; of `repeats` the median counts. Every scorer has to have seen
-    the scene.
+    `turn` draws who goes when; of `repeats` the median counts. Every scorer has to have seen the
+    scene.
     """
     stops: list[Stop] = ["first" if GUIDES[each.mode].first else config.stop for each in asked]
     ways: list[tuple[Guide | None, PlannerConfig]] = [
@@ -144,8 +145,7 @@ def side_by_side(
     ours = PLANNERS["ours"]
     runs: list[list[Timed]] = [[] for _ in ways]
     for repeat in range(repeats):
-        for position in range(len(ways)):
-            which = (position + turn + repeat) % len(ways)
+        for which in _drawn(len(ways), turn, repeat):
             guide, its = ways[which]
             runs[which].append(timed(ours, scene, goal, its, guide))
     middle = [_middle(some) for some in runs]
@@ -154,6 +154,11 @@ def side_by_side(
         Pair(asked=each, stop=stop, unguided=unguided[stop], guided=found)
         for each, stop, found in zip(asked, stops, middle[len(unguided) :], strict=True)
     ]
+
+
+def _drawn(count: int, *which: int) -> list[int]:
+    """An order of the ways, by which task and repeat it is of."""
+    return np.random.default_rng(which).permutation(count).tolist()
 
 
 def _middle(runs: Sequence[Timed]) -> Timed:
@@ -179,13 +184,12 @@ def beside_another(
     """Plan a task by another planner, unguided and then in every way that is asked for, given what
     it found; one pair a way, none where it finds no plan. Its first plan counts.
 
-    `turn` rotates who goes first of the guided ones.
+    `turn` draws who goes when of the guided ones.
     """
     unguided = timed(planner, scene, goal, config)
     ways = asked(unguided.result) if unguided.solved else []
     found: dict[int, Timed] = {}
-    for position in range(len(ways)):
-        which = (position + turn) % len(ways)
+    for which in _drawn(len(ways), turn):
         found[which] = timed(planner, scene, goal, config, ways[which].guide)
     return unguided, [
         Pair(asked=each, stop="first", unguided=unguided, guided=found[which])
