@@ -286,8 +286,8 @@ def work_table(found: Sequence[Figures]) -> Table:
         "actions",
     )
     title = (
-        "Work a task with a plan, means of u / g / o; sequences tried until solved and actions: where all "
-        "three solve"
+        "Work a task with a plan, means of u / g / o; sequences tried until solved and actions: "
+        "where all three solve"
     )
     return Table(name="guides-work", title=title, columns=columns, rows=tuple(lines))
 
