@@ -370,7 +370,7 @@ def gain_plot(*axes: Axes, found: Sequence[Figures]) -> None:
             _line(ax, [(e.size, e.gain_wide) for e in its], name, color, style)
         ax.set(ylabel="unguided over guided time")
         _over_boxes(ax, some)
-    axes[0].legend(loc="upper left", handlelength=3)
+    axes[-1].legend(loc="lower right", handlelength=2.4, columnspacing=1, ncols=2)
 
 
 def solved_plot(*axes: Axes, rows: Sequence[Rerun]) -> None:
