@@ -150,6 +150,21 @@ def test_lazy_looks_once_it_has_done_its_work_and_not_before():
 
 
 @SEARCHES
+def test_a_lazy_guide_that_does_not_look_does_what_the_unguided_search_does(crowded, search):
+    first, asked = PlannerConfig(search=search, stop="first"), 0
+    for scene, goal in crowded[:12]:
+        plain = plan(scene, goal, config=first, replay=False)
+        for patience in (10**9, 100):
+            guide = Guide(scorer=Says(plain.moved), mode="lazy", patience=patience)
+            result = plan(scene, goal, config=first, guide=guide, replay=False)
+            asked += result.looked
+            if not result.looked:
+                assert (result.counts, result.moved) == (plain.counts, plain.moved)
+                assert (result.status, result.reason) == (plain.status, plain.reason)
+    assert 0 < asked <= 12
+
+
+@SEARCHES
 @pytest.mark.parametrize("mode", [name for name, kind in GUIDES.items() if kind.complete])
 def test_what_the_late_bounds_refused_is_not_tried_again(monkeypatch, search, mode):
     tried = Counter()
