@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import streamlit as st
 
-from dashboards.asking import Choice, ask, version_of
+from dashboards.asking import SCENES, Choice, ask, version_of
 from dashboards.showing import command, plain, tighten
 from relevance.errors import RelevanceError
 from relevance.scene import FAMILIES
@@ -51,6 +51,8 @@ STARTS = {
 """What the widgets say at first, by their keys."""
 JUDGING = ("Scenes", "Models", "Planning")
 """Pages on which a checkpoint is asked."""
+SAMPLED = ("Models", "Planning")
+"""Pages that judge it by a part of a large split."""
 
 
 def main() -> None:
@@ -71,7 +73,7 @@ def main() -> None:
         unopened(path, error)
         return
     try:
-        st.session_state["choice"] = choice = choose(dataset, path, judging=page.title in JUDGING)
+        st.session_state["choice"] = choice = choose(dataset, path, page.title)
         if choice.version[0]:
             page.run()
         else:
@@ -80,16 +82,16 @@ def main() -> None:
         broken(path, error)
 
 
-def choose(dataset: Dataset, path: str, *, judging: bool) -> Choice:
-    """The side bar."""
+def choose(dataset: Dataset, path: str, page: str) -> Choice:
+    """The side bar of a page."""
     own = dataset.labelling.policy if dataset.labelling else None
     given = Choice(path=path, version=version_of(path), own_policy=own, policy=own)
-    if not judging:
+    if page not in JUDGING:
         return given
     with st.sidebar:
         split = st.selectbox("Split", SPLITS, key="pick_split")
         policies = {row["checkpoint_id"]: row["policy"] for row in ask(given, "checkpoints")}
-        given = replace(given, split=split)
+        given = replace(given, split=split, every=1)
         if not policies:
             return given
         if st.session_state["pick_checkpoint"] not in policies:  # another dataset's
@@ -98,7 +100,18 @@ def choose(dataset: Dataset, path: str, *, judging: bool) -> Choice:
             "Checkpoint", list(policies), key="pick_checkpoint", help="The newest comes first."
         )
         given = replace(given, checkpoint=checkpoint, policy=policies[checkpoint])
+        if page in SAMPLED:
+            given = sampled(given)
         return replace(given, beta=choose_beta(given))
+
+
+def sampled(given: Choice) -> Choice:
+    """The split, or every so-manieth shard of it where it is large."""
+    scenes = ask(given, "scene_totals", splits=[given.split])[0]["scenes"]
+    every = max(1, round(scenes / SCENES))
+    if every > 1:
+        st.caption(f"Judged by one shard in {every} of the split, which has {scenes:,} scenes.")
+    return replace(given, every=every)
 
 
 def choose_beta(given: Choice) -> float:

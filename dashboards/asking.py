@@ -8,12 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 
 import streamlit as st
 
-from relevance.store import Dataset, DatasetError, Sample, decode, is_remote, locate, needs
+from relevance.store import (
+    Dataset,
+    DatasetError,
+    Labelling,
+    Sample,
+    decode,
+    is_remote,
+    locate,
+    needs,
+)
 
 SQL = Path(__file__).parent / "sql"
 
@@ -31,15 +42,43 @@ class Choice:
     split: str = "test"
     checkpoint: str | None = None
     beta: float = 0.0
+    every: int = 0
+    """Of the split every so-manieth shard is looked at, and nothing else; everything when 0."""
 
     @property
     def dataset(self) -> Dataset:
         """The dataset, whose files' footers are read once."""
-        return _Kept.open(self.path)
+        return _opened(self.path, (self.split, self.every))
+
+
+SCENES = 2_500
+"""About as many judge a checkpoint: more would cost memory and time alone."""
+MEMORY = "200MB"
+"""Of one query; what takes more is put on disk meanwhile."""
 
 
 class _Kept(Dataset):
     """A dataset that reads a file's footer again only when the file has changed."""
+
+    part: tuple[str, int] = "", 0
+    """Split and `Choice.every`: what there is besides is not seen."""
+
+    def files(self, table: str, *, of: Labelling | None = None, **where: Any) -> list[Path]:
+        found = super().files(table, of=of, **where)
+        split, every = self.part
+        if not every:
+            return found
+        keys = [self.file_keys(file) for file in found]
+        seen = [
+            key.get("split", split) == split and key.get("shard", 0) % every == 0 for key in keys
+        ]
+        return list(compress(found, seen))
+
+    def connect(self, **how: Any) -> Any:
+        connection = super().connect(**how)
+        connection.execute(f"SET memory_limit = '{MEMORY}'")
+        connection.execute("SET temp_directory = ?", [gettempdir()])
+        return connection
 
     def metadata(self, file: Path) -> dict[str, str]:
         if is_remote(file) or not file.is_file():
@@ -50,6 +89,12 @@ class _Kept(Dataset):
             known = (state.st_size, state.st_mtime_ns, super().metadata(file))
             _FOOTERS[file] = known
         return known[2]
+
+
+def _opened(path: str, part: tuple[str, int]) -> _Kept:
+    dataset = _Kept.open(path)
+    dataset.part = part
+    return dataset
 
 
 _FOOTERS: dict[Path, tuple[int, int, dict[str, str]]] = {}
@@ -73,19 +118,21 @@ def chosen() -> Choice:
 def ask(choice: Choice, query: str, **variables: Any) -> list[dict[str, Any]]:
     """Rows of `sql/QUERY.sql`; raises DatasetError when the dataset cannot answer."""
     policy = choice.policy if choice.policy != choice.own_policy else None
-    return _ask(choice.path, choice.version, policy, query, variables)
+    part = (choice.split, choice.every) if choice.every else ("", 0)
+    return _ask(choice.path, choice.version, part, policy, query, variables)
 
 
 @st.cache_data(show_spinner=False, max_entries=300)
 def _ask(
     path: str,
     version: tuple[int, int],
+    part: tuple[str, int],
     policy: str | None,
     query: str,
     variables: Mapping[str, Any],
 ) -> list[dict[str, Any]]:
     text = (SQL / f"{query}.sql").read_text(encoding="utf-8")
-    with _Kept.open(path).connect(policy=policy, names=needs(text)) as connection:
+    with _opened(path, part).connect(policy=policy, names=needs(text)) as connection:
         try:
             for name, value in variables.items():
                 connection.execute(f"SET VARIABLE {name} = ?", [value])

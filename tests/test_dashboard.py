@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
@@ -119,6 +120,28 @@ def test_a_changed_file_is_read_again(tmp_path) -> None:
     dataset.write_rows("plans", rows[1:], **keys, made_by={"config": "c", "planner": "p"})
     assert choice.dataset.metadata(file)["config"] == "c"
     assert ask(all_of(root), "goal_totals")[0]["goals"] == before - 1
+
+
+def test_of_a_large_split_some_shards_are_judged(page, monkeypatch) -> None:
+    root, checkpoint = evaluated()
+    whole = Dataset.open(root)
+    shards = whole.shards("test")
+    assert len(shards) > 1
+    some = replace(all_of(root), split="test", checkpoint=checkpoint.stem, every=2)
+    assert some.dataset.shards("test") == [shard for shard in shards if shard % 2 == 0]
+    assert not some.dataset.files("labels", split="train")
+    asked = {"checkpoint_id": checkpoint.stem, "split": "test"}
+    goals = [ask(replace(some, every=n), "betas", **asked)[0]["goals"] for n in (0, 1, 2)]
+    assert goals[0] == goals[1] > goals[2] > 0
+    assert len(read_predictions(some.dataset, checkpoint.stem)) < len(
+        read_predictions(whole, checkpoint.stem)
+    )
+    assert not any("one shard in" in said.value for said in page(root, "models").caption)
+    scenes = len(whole.read_rows("scenes", split="test"))
+    monkeypatch.setattr("dashboards.asking.SCENES", -(-scenes // 2))
+    app = page(root, "models")
+    assert not app.exception
+    assert any(f"one shard in 2 of the split, which has {scenes}" in s.value for s in app.caption)
 
 
 def test_the_first_figure_waits_for_nothing_heavy() -> None:

@@ -44,7 +44,7 @@ DRAWN = ("n_objects", "predicate", "stands", "visible")
 """Breakdowns that are drawn, in the order in which they fill the columns."""
 
 
-@st.cache_data(show_spinner=False, max_entries=8)
+@st.cache_resource(show_spinner=False, max_entries=4)  # not copied: they are large
 def predicted(choice: Choice) -> tuple[Predictions, list[str]]:
     """A checkpoint's predictions on the split, and what to know of them."""
     name = choice.checkpoint or ""

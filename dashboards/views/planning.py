@@ -78,8 +78,8 @@ def reruns(
     return swept(rows, scored), measured
 
 
-def working(choice: Choice) -> None:
-    """What the chosen beta keeps, of what is relevant, and saves."""
+def working(choice: Choice) -> bool:
+    """What the chosen beta keeps, of what is relevant, and saves; whether there are scores."""
     asked = {"checkpoint_id": choice.checkpoint, "split": choice.split}
     curve = ask(choice, "betas", betas=BETAS, **asked)
     if not curve or not curve[0]["goals"]:
@@ -87,7 +87,7 @@ def working(choice: Choice) -> None:
             f"This checkpoint has not scored the {choice.split} split yet:",
             f"relevance evaluate {choice.path} --checkpoint {choice.checkpoint}",
         )
-        return
+        return False
     now = ask(choice, "betas", betas=[choice.beta], **asked)[0]
     tasks, measured = reruns(
         choice.path, choice.version, str(choice.checkpoint), choice.split, choice.policy
@@ -136,6 +136,7 @@ def working(choice: Choice) -> None:
         "that keeps as many objects of a goal as one at which it was rerun costs what that run "
         "did; between two such, time is read off between theirs."
     )
+    return True
 
 
 def missed(choice: Choice) -> None:
@@ -178,7 +179,7 @@ found = guided(*known)
 for note in found["notes"]:
     st.warning(note)
 st.subheader("At this beta", anchor=False)
-working(choice)
+scored = working(choice)
 st.subheader("Guided against unguided", anchor=False)
 if found["searches"]:
     names = {section["search"]: section for section in found["searches"]}
@@ -217,4 +218,5 @@ else:
         "The planner was not rerun with this checkpoint yet:",
         f"relevance evaluate {choice.path} --checkpoint {choice.checkpoint}",
     )
-missed(choice)
+if scored:
+    missed(choice)

@@ -1,9 +1,7 @@
 """Subcommands that run other programs: demo (the flows), dashboard (streamlit)."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
-import os
 import socket
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -70,22 +68,13 @@ def _dashboard(_: Preset) -> Callable[..., int]:
             address: For whom it listens; this machine only, unless changed.
         """
         at_least("--port", port, 1, 65535)
-        import dashboards
+        from dashboards.serving import serve
         from relevance.store import Dataset
 
         Dataset.open(dataset)
         _free(address, port)
-        app = Path(next(iter(dashboards.__path__))) / "app.py"
-        options = {
-            "server.port": port,
-            "server.address": address,
-            "server.headless": "true",
-            "browser.gatherUsageStats": "false",
-        }
-        flags = [f"--{name}={value}" for name, value in options.items()]
-        command = [sys.executable, "-m", "streamlit", "run", str(app), *flags, "--", str(dataset)]
-        sys.stdout.flush()
-        os.execv(sys.executable, command)  # who ends this command ends the page
+        serve(dataset, address=address, port=port)
+        return 0
 
     return dashboard
 

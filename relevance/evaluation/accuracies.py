@@ -17,7 +17,7 @@ import numpy as np
 from relevance.evaluation.predictions import policy_of_checkpoint
 from relevance.metrics import Accuracy, average_precision, calibration_error
 from relevance.scene import FAMILIES, PREDICATES
-from relevance.store import Dataset
+from relevance.store import Dataset, arrays
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,24 +87,26 @@ def read_predictions(dataset: Dataset, checkpoint_id: str, *, split: str = "test
     policy = policy_of_checkpoint(dataset, checkpoint_id)
     names = ("judged", "predictions", "labels", "scenes", "objects", "carried")
     with dataset.connect(policy=policy, names=names) as connection:
-        columns = connection.execute(
+        found = arrays(
+            connection,
             """
-            select predicate, family, relevant, score, raw_score, is_goal_object, stands,
-                n_objects, visible_fraction, ambiguous, query = subject as is_subject,
-                dense_rank() over (order by scene_id) as scene,
-                dense_rank() over (order by scene_id, predicate, subject, reference) as task
+            select scene_id, subject, reference, query,
+                predicate, family, relevant, score, raw_score, is_goal_object, stands,
+                n_objects, visible_fraction, ambiguous, query = subject as is_subject
             from judged
-            where checkpoint_id = ? and split = ? and policy = ?
-            order by task, query
+            where checkpoint_id = $1 and split = $2 and policy = $3
             """,
             [checkpoint_id, split, policy],
-        ).fetchnumpy()
-    kinds = {"predicate": str, "family": str, "stands": str, "scene": int, "task": int}
-    kinds |= {"n_objects": int}
-    kinds |= dict.fromkeys(("relevant", "is_goal_object", "is_subject", "ambiguous"), bool)
-    return Predictions(
-        **{name: np.asarray(column, kinds.get(name, float)) for name, column in columns.items()}
-    )
+        )
+    # sorted here: the database would sort the texts, with all that stands in their rows
+    names = ("scene_id", "predicate", "subject", "reference", "query")
+    key = np.array([np.unique(found[name], return_inverse=True)[1] for name in names])
+    order = np.lexsort(key[::-1])
+    goal = key[:-1, order]
+    another = (goal[:, 1:] != goal[:, :-1]).any(axis=0)
+    task = np.concatenate([[0], np.cumsum(another)])[: len(order)]
+    own = {field.name for field in fields(Predictions)} & {*found}
+    return Predictions(scene=goal[0], task=task, **{name: found[name][order] for name in own})
 
 
 # --- tables -----------------------------------------------------------------------------------

@@ -398,4 +398,4 @@ def training_curve(ax: Axes, history: Sequence[Mapping[str, float]]) -> None:
         format(FuncFormatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "125" else ""))
     ax.set_xlabel("step")
     ax.set_ylabel("training loss")
-    ax.legend(ncols=2)
+    ax.legend(ncols=len(names), loc="lower left", bbox_to_anchor=(0, 1), columnspacing=1.2)

@@ -22,7 +22,7 @@ from relevance.store.paths import (
     replacing,
     sweep,
 )
-from relevance.store.queries import replanned, sql
+from relevance.store.queries import arrays, replanned, sql
 from relevance.store.streaming import polled, shuffled
 from relevance.store.synthetic import synthetic_labels
 from relevance.store.tables import (
@@ -51,6 +51,7 @@ __all__ = [
     "TableSchema",
     "absolute",
     "altered",
+    "arrays",
     "compact",
     "copy_file",
     "create_object",

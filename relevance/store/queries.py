@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
 import duckdb
+import numpy as np
+import pyarrow as pa
 
 from relevance.store import compacting, labellings
 from relevance.store.files import Files
@@ -92,6 +94,24 @@ def sql(
             return _distinct(names), [tuple(map(_plain, row)) for row in result.fetchall()]
         except duckdb.Error as error:
             raise DatasetError(f"query: {one_line(error)}") from None
+
+
+def arrays(
+    connection: duckdb.DuckDBPyConnection, query: str, values: Sequence[Any] = ()
+) -> dict[str, np.ndarray]:
+    """A query's columns, (R,) each; its `$1`, `$2`, ... are `values`.
+
+    Texts are NumPy's: as objects they would take most of the memory.
+    """
+    body = connection.sql(query, params=list(values)).to_arrow_table()
+    return {name: _array(body[name]) for name in body.column_names}
+
+
+def _array(column: pa.ChunkedArray) -> np.ndarray:
+    if not pa.types.is_string(column.type):
+        return column.to_numpy()
+    texts = column.combine_chunks().dictionary_encode()
+    return np.array(texts.dictionary.to_pylist(), str)[texts.indices.to_numpy()]
 
 
 def replanned(
