@@ -44,6 +44,8 @@ def test_shipped_models_are_halved_and_say_how_they_are_made(
     for name, weight in whole.state_dict().items():
         torch.testing.assert_close(model.state_dict()[name], weight.half().float())
     assert "history" not in meta
+    calibration = meta.pop("calibration")
+    assert calibration["needs"]
     assert {key: meta[key] for key in meta} == {key: known[key] for key in meta}
     page = path.with_suffix(".md").read_text()
     config = TrainConfig.from_dict(meta["config"])

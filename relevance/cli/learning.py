@@ -65,7 +65,7 @@ def _ship(preset: str, body: str | None = None) -> Callable[..., int]:
         config: Annotated[TrainConfig, tyro.conf.arg(name="")] = start,
     ) -> int:
         """Make a model that comes with the package: train it, choose when it looks as `lazy`, halve
-        it, write a page about it.
+        it, write a page about it, calibrate it.
 
         What was trained with these settings on this dataset is taken. Prints the path.
 
@@ -74,7 +74,7 @@ def _ship(preset: str, body: str | None = None) -> Callable[..., int]:
             out: Folder of the models; those of a checkout are in data/models.
             name: What it is called; the body when not given.
         """
-        from relevance.evaluation import tune_once
+        from relevance.evaluation import calibrate, tune_once
         from relevance.training import ship, train
 
         with bar("steps") as progress:
@@ -83,6 +83,8 @@ def _ship(preset: str, body: str | None = None) -> Callable[..., int]:
             tune_once(dataset, checkpoint, progress=progress)
         with bar("steps") as progress:
             path = ship(dataset, config, out, name=name or "", progress=progress)
+        with bar("shards scored") as progress:
+            calibrate(dataset, path, progress=progress)
         print(path)
         return 0
 

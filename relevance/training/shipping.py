@@ -44,11 +44,11 @@ def ship(
         weight.data = weight.data.half()
     save_checkpoint(path, model, kept)
     with replacing(path.with_suffix(".md")) as temporary:
-        temporary.write_text(_card(name, Path(root), config, path, meta), encoding="utf-8")
+        temporary.write_text(_card(name, Path(root), config, meta), encoding="utf-8")
     return path
 
 
-def _card(name: str, root: Path, config: TrainConfig, path: Path, meta: Mapping[str, Any]) -> str:
+def _card(name: str, root: Path, config: TrainConfig, meta: Mapping[str, Any]) -> str:
     """The page about a model."""
     body = BODIES[config.model.body]
     offsets = meta.get("offsets", {})
@@ -66,7 +66,7 @@ def _card(name: str, root: Path, config: TrainConfig, path: Path, meta: Mapping[
 A `{config.model.body}` of {meta["parameters"]:,} parameters: it {sees}.
 `relevance.load_guide("{name}")`, `relevance plan ... --checkpoint {name}`.
 
-- checkpoint `{meta["checkpoint_id"]}`, {path.stat().st_size / 1e6:.1f} MB, weights halved
+- checkpoint `{meta["checkpoint_id"]}`, weights halved
 - trained in {meta["train_seconds"] / 60:.1f} minutes on {meta["device"]}, {config.steps:,} \
 steps, on data `{meta["dataset_hash"]}`, labels of policy `{config.policy}`
 - made by `{command(config, root)}`
