@@ -129,7 +129,7 @@ def label_shares(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     ax.barh(y, shares, height=0.56, color=colors)
     end = max([*shares, 0.3]) * 1.08
     for at, row, share in zip(y, rows, shares, strict=True):
-        text = f"{100 * share:.1f}% of {row['queries']}"
+        text = f"{100 * share:.1f}% of {row['queries']:,}"
         ax.text(end * 1.03, at, text, va="center", fontsize=8.5)
         theirs = paper().train.get(row["group"])
         if theirs:
@@ -153,13 +153,13 @@ def lengths(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
         if total:
             at = np.arange(len(lengths)) + (number - (len(GROUPS) - 1) / 2) * width
             shares = [counts[length] / total for length in lengths]
-            label = f"{group} (n = {total})"
+            label = f"{group} (n = {total:,})"
             ax.bar(at, shares, width * 0.92, color=family_color(group), label=label)
     ax.set_xticks(range(len(lengths)), [str(length) for length in lengths])
     ax.set_xlabel("actions in the plan")
     ax.set_ylabel("share of solved tasks")
     ax.grid(axis="x", visible=False)
-    ax.margins(y=0.2)
+    ax.margins(y=0.4)  # the legend's place
     ax.legend(loc="upper right")
     _percent_axis(ax.yaxis)
 
@@ -169,7 +169,7 @@ def reasons(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     counts = [row["goals"] for row in rows]
     ax.barh(y, counts, height=0.56, color=PALE)
     for at, count in zip(y, counts, strict=True):
-        ax.text(count + max(counts) * 0.01, at, str(count), va="center", fontsize=8.5)
+        ax.text(count + max(counts) * 0.01, at, f"{count:,}", va="center", fontsize=8.5)
     ax.set_yticks(y, [textwrap.fill(row["label"], 26) for row in rows])
     ax.set_xlim(0, max(counts) * 1.12)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -184,7 +184,7 @@ def times(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     ax.text(low * 0.88, 0.03, "paper, means", ha="right", color=MUTED, fontsize=8.5)
     for row in rows:
         found, group = row["quantiles"], row["family"]
-        label = f"{group}: median {seconds(found[len(found) // 2])} (n = {row['n']})"
+        label = f"{group}: median {seconds(found[len(found) // 2])} (n = {row['n']:,})"
         ax.plot(found, QUANTILES, color=family_color(group), label=label)
     ax.set_xlabel("planning time of a task")
     ax.set_ylabel("share of tasks done")
