@@ -307,6 +307,10 @@ def test_against_lists_the_tasks_in_which_the_peer_does_better(tasks):
 def test_versus_needs_a_checkout(tasks, tmp_path):
     with pytest.raises(BenchmarkError, match="expected a checkout"):
         measure_versus(tasks[:1], tmp_path)
+
+
+@pytest.mark.slow  # a process starts and warms up
+def test_versus_says_when_the_other_planner_stops(tasks, tmp_path):
     broken = tmp_path / "relevance" / "planner"
     broken.mkdir(parents=True)
     (broken.parent / "__init__.py").touch()
@@ -415,6 +419,7 @@ def test_a_file_where_the_folder_belongs_is_one_line(tmp_path, capsys):
     assert "taken: File exists, expected a folder" in capsys.readouterr().err
 
 
+@pytest.mark.slow  # trains every body
 def test_training_is_measured_for_every_reading(tmp_path, capsys):
     flags = ["--bodies", "vit", "geometry", "--scenes", "1", "--goals", "1", "--objects", "3"]
     flags += ["--queries", "1", "--seconds", "0", "--device", "cpu", "--out", str(tmp_path)]

@@ -278,6 +278,7 @@ def _one(arguments: tuple[Path, ShardSpec]) -> None:
         label_shard(root, CONFIG, spec, predicate)
 
 
+@pytest.mark.slow  # tests/test_flows.py compares the bytes of two workers, too
 def test_two_workers_give_the_bytes_of_one(tmp_path: Path) -> None:
     specs = prepare(tmp_path, CONFIG)
     spawn = multiprocessing.get_context("spawn")

@@ -39,9 +39,10 @@ def learning(*axes: Axes, rows: Sequence[Row]) -> None:
     labels = list(dict.fromkeys(row["label"] for row in rows))
     for number, label in enumerate(labels):
         mine, color = [row for row in rows if row["label"] == label], COLORS[number % len(COLORS)]
-        steps = [entry["step"] for entry in mine[0]["history"]]
-        losses = [[entry["relevance"] for entry in row["history"]] for row in mine]
-        _line(loss, _minutes(mine, steps), losses, color, label)
+        if told := [row for row in mine if row["history"]]:
+            steps = [entry["step"] for entry in told[0]["history"]]
+            losses = [[entry["relevance"] for entry in row["history"]] for row in told]
+            _line(loss, _minutes(told, steps), losses, color, label)
         steps = [point["step"] for point in mine[0]["validations"]]
         for ax, family in zip(accuracies, families_of(rows), strict=True):
             points = [[_right(point, family) for point in row["validations"]] for row in mine]

@@ -257,7 +257,7 @@ def _row(dataset: Dataset, config: TrainConfig, meta: Mapping[str, Any]) -> Row:
     model = config.model
     kept = (
         "checkpoint_id", "dataset_hash", "parameters", "bfloat16", "core_seconds",
-        "train_seconds", "wait_seconds", "asked", "offsets", "history", "validations",
+        "train_seconds", "wait_seconds", "asked", "offsets", "validations",
     )  # fmt: skip
     return {
         "body": model.body,
@@ -271,6 +271,7 @@ def _row(dataset: Dataset, config: TrainConfig, meta: Mapping[str, Any]) -> Row:
         "steps": config.steps,
         "scenes_shown": meta["scenes"],
         **{name: meta[name] for name in kept},
+        "history": meta.get("history", []),  # the package's models come without
         "config": config.to_dict(),
         "validation": meta["metrics"],
     }
