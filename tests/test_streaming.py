@@ -478,3 +478,39 @@ def test_an_empty_dataset_of_a_predicate(root: Path) -> None:
 def test_a_batch_has_a_share_for_every_process(made: Path) -> None:
     with pytest.raises(TrainingError, match="4 scenes a batch for 5 processes, expected at least"):
         reader(made, CONFIG, ranks=5)
+
+
+TOLD_TWICE = """
+import os, signal, threading, time
+from contextlib import closing
+from relevance.store import polled
+
+class Stop(BaseException):
+    pass
+
+told = []
+def stop(*_):
+    told.append(time.monotonic())
+    raise Stop
+
+signal.signal(signal.SIGTERM, stop)
+def slow(number):
+    time.sleep(1.5 if number else 0)
+    return number
+
+try:
+    with closing(polled([iter(range(3))], slow, count=None, workers=1)) as numbers:
+        assert next(numbers) == 0
+        for wait in (0.3, 0.6):
+            threading.Timer(wait, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        time.sleep(5)
+except Stop:
+    print("told", len(told))
+"""
+
+
+def test_who_is_told_twice_to_end_says_nothing_of_generators() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", TOLD_TWICE], capture_output=True, text=True, timeout=120
+    )
+    assert (done.stdout, done.stderr) == ("told 2\n", "")

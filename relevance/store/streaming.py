@@ -6,8 +6,9 @@ each of them goes through the same undecoded samples, which is cheap, and finish
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from functools import partial
 from itertools import islice
 from typing import Any, TypeVar, cast
@@ -46,7 +47,7 @@ def polled(
     *,
     count: int | None,
     workers: int,
-) -> Iterator[Any]:
+) -> Generator[Any]:
     """One of each stream in turn until one ends, `count` in all, each finished by some worker.
 
     0 workers: all is done here. What a user can mend is raised here, where it would have come.
@@ -72,13 +73,16 @@ def polled(
     # Forked, workers have all that is here; what is not safe in a fork they open anew.
     how: dict[str, Any] = {"multiprocessing_context": "fork"} if workers else {}
     loader = iter(WebLoader(pipeline, batch_size=None, num_workers=workers, **how))
-    for found in _taken_ahead(loader) if workers else loader:
-        if isinstance(found, RelevanceError):
-            raise found
-        yield found
+    # closed here, not when nobody knows it any more: who is told twice to end would see the second
+    # time as an error of a forgotten generator
+    with closing(_taken_ahead(loader) if workers else (found for found in loader)) as source:
+        for found in source:
+            if isinstance(found, RelevanceError):
+                raise found
+            yield found
 
 
-def _taken_ahead(source: Iterator[Any]) -> Iterator[Any]:
+def _taken_ahead(source: Iterator[Any]) -> Generator[Any]:
     """The same, each taken from its process by a thread while the one before is in use."""
     end = object()
     found = next(source, end)  # here: processes fork, which they had better not do in a thread

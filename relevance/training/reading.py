@@ -10,6 +10,7 @@ undecoded.
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, count, islice
@@ -90,17 +91,18 @@ class Reader:
         begin = looks_of(first, groups, self.config)[0][0]
         end = self._looks_in_all
         looks = polled(self._streams(begin), self._learned, count=end - begin, workers=self.workers)
-        ahead = enumerate(looks, begin)
-        at, batch = next(ahead)
-        for step in range(first, self.config.steps):
-            found = []
-            for look, turns in looks_of(step, groups, self.config):
-                while at < look:
-                    at, batch = next(ahead)
-                found.append(replace(batch, turns=batch.turns[turns]))
-            yield found
+        with closing(looks):
+            ahead = enumerate(looks, begin)
+            at, batch = next(ahead)
+            for step in range(first, self.config.steps):
+                found = []
+                for look, turns in looks_of(step, groups, self.config):
+                    while at < look:
+                        at, batch = next(ahead)
+                    found.append(replace(batch, turns=batch.turns[turns]))
+                yield found
 
-    def whole(self, scenes: int = 16, *, most: int | None = None) -> Iterator[Batch]:
+    def whole(self, scenes: int = 16, *, most: int | None = None) -> Generator[Batch]:
         """Every labelled scene once, in stored order, with all its goals; of each shard the first
         `most`."""
         stream = chain.from_iterable(

@@ -264,7 +264,8 @@ def train(
                     run.save(trainer)
         scenes, *asked = ranks.totals([trainer.scenes, *trainer.asked.values()])
         if ranks.first:
-            metrics = measure(trainer.model, reader_for(validation, trainer).whole())
+            with closing(reader_for(validation, trainer).whole()) as batches:
+                metrics = measure(trainer.model, batches)
             meta = {
                 "checkpoint_id": name,
                 "config": own.to_dict(),
@@ -301,8 +302,8 @@ def _validated(config: TrainConfig) -> set[int]:
 def _validate(trainer: Trainer, validation: Catalogue) -> None:
     """Judge some validation scenes: a point of the learning curve."""
     most = trainer.config.validation_scenes
-    some = reader_for(validation.some(most), trainer)
-    found = measure(trainer.model, some.whole(most=most))
+    with closing(reader_for(validation.some(most), trainer).whole(most=most)) as batches:
+        found = measure(trainer.model, batches)
     queries = {group: its["queries"] for group, its in found.items()}
     trainer.validations.append({"step": trainer.done, "queries": queries})
 
