@@ -91,7 +91,7 @@ def choose(dataset: Dataset, path: str, page: str) -> Choice:
     with st.sidebar:
         split = st.selectbox("Split", SPLITS, key="pick_split")
         policies = {row["checkpoint_id"]: row["policy"] for row in ask(given, "checkpoints")}
-        given = replace(given, split=split, every=1)
+        given = replace(given, split=split, shards=tuple(dataset.shards(split)))
         if not policies:
             return given
         if st.session_state["pick_checkpoint"] not in policies:  # another dataset's
@@ -106,12 +106,17 @@ def choose(dataset: Dataset, path: str, page: str) -> Choice:
 
 
 def sampled(given: Choice) -> Choice:
-    """The split, or every so-manieth shard of it where it is large."""
+    """The split, or every so-manieth shard of each of its families where it is large."""
     scenes = ask(given, "scene_totals", splits=[given.split])[0]["scenes"]
     every = max(1, round(scenes / SCENES))
-    if every > 1:
-        st.caption(f"Judged by one shard in {every} of the split, which has {scenes:,} scenes.")
-    return replace(given, every=every)
+    if every == 1:
+        return given
+    judging = ask(given, "judged_shards", split=given.split, every=every)
+    st.caption(
+        f"Judged by one shard in {every} of each family, {sum(row['scenes'] for row in judging):,} "
+        f"of {scenes:,} scenes."
+    )
+    return replace(given, shards=tuple(row["shard"] for row in judging))
 
 
 def choose_beta(given: Choice) -> float:

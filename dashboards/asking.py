@@ -29,6 +29,10 @@ from relevance.store import (
 SQL = Path(__file__).parent / "sql"
 
 
+Part = tuple[str, tuple[int, ...]] | None
+"""A split and shards of it; everything when None."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choice:
     """What the side bar says."""
@@ -42,13 +46,18 @@ class Choice:
     split: str = "test"
     checkpoint: str | None = None
     beta: float = 0.0
-    every: int = 0
-    """Of the split every so-manieth shard is looked at, and nothing else; everything when 0."""
+    shards: tuple[int, ...] | None = None
+    """Those of the split that are looked at, and nothing else; everything when None."""
 
     @property
     def dataset(self) -> Dataset:
         """The dataset, whose files' footers are read once."""
-        return _opened(self.path, (self.split, self.every))
+        return _opened(self.path, self.part)
+
+    @property
+    def part(self) -> Part:
+        """What is looked at, and nothing else."""
+        return None if self.shards is None else (self.split, self.shards)
 
 
 SCENES = 2_500
@@ -60,17 +69,18 @@ MEMORY = "200MB"
 class _Kept(Dataset):
     """A dataset that reads a file's footer again only when the file has changed."""
 
-    part: tuple[str, int] = "", 0
-    """Split and `Choice.every`: what there is besides is not seen."""
+    part: Part = None
+    """What there is besides is not seen."""
 
     def files(self, table: str, *, of: Labelling | None = None, **where: Any) -> list[Path]:
         found = super().files(table, of=of, **where)
-        split, every = self.part
-        if not every:
+        if self.part is None:
             return found
+        split, shards = self.part[0], frozenset(self.part[1])
         keys = [self.file_keys(file) for file in found]
         seen = [
-            key.get("split", split) == split and key.get("shard", 0) % every == 0 for key in keys
+            key.get("split", split) == split and ("shard" not in key or key["shard"] in shards)
+            for key in keys
         ]
         return list(compress(found, seen))
 
@@ -91,7 +101,7 @@ class _Kept(Dataset):
         return known[2]
 
 
-def _opened(path: str, part: tuple[str, int]) -> _Kept:
+def _opened(path: str, part: Part) -> _Kept:
     dataset = _Kept.open(path)
     dataset.part = part
     return dataset
@@ -118,15 +128,14 @@ def chosen() -> Choice:
 def ask(choice: Choice, query: str, **variables: Any) -> list[dict[str, Any]]:
     """Rows of `sql/QUERY.sql`; raises DatasetError when the dataset cannot answer."""
     policy = choice.policy if choice.policy != choice.own_policy else None
-    part = (choice.split, choice.every) if choice.every else ("", 0)
-    return _ask(choice.path, choice.version, part, policy, query, variables)
+    return _ask(choice.path, choice.version, choice.part, policy, query, variables)
 
 
 @st.cache_data(show_spinner=False, max_entries=300)
 def _ask(
     path: str,
     version: tuple[int, int],
-    part: tuple[str, int],
+    part: Part,
     policy: str | None,
     query: str,
     variables: Mapping[str, Any],

@@ -122,26 +122,40 @@ def test_a_changed_file_is_read_again(tmp_path) -> None:
     assert ask(all_of(root), "goal_totals")[0]["goals"] == before - 1
 
 
+def test_some_shards_of_each_family_stand_for_a_large_split() -> None:
+    shards = {0: "on", 1: "same-plane", 2: "on", 3: "stacks", 5: "on", 6: "same-plane", 8: "on"}
+    with duckdb.connect() as plain:
+        plain.execute("CREATE TABLE scenes (split VARCHAR, shard INTEGER, family VARCHAR)")
+        for shard, family in shards.items():
+            plain.execute("INSERT INTO scenes VALUES ('test', ?, ?)", [shard, family])
+        plain.execute("INSERT INTO scenes VALUES ('train', 4, 'apart')")
+        text = (SQL / "judged_shards.sql").read_text()
+        for every, expected in ((1, list(shards)), (2, [0, 1, 3, 5]), (9, [0, 1, 3])):
+            plain.execute("SET VARIABLE every = ?", [every])
+            assert [row[0] for row in plain.execute(text).fetchall()] == expected
+
+
 def test_of_a_large_split_some_shards_are_judged(page, monkeypatch) -> None:
     root, checkpoint = evaluated()
     whole = Dataset.open(root)
     shards = whole.shards("test")
     assert len(shards) > 1
-    some = replace(all_of(root), split="test", checkpoint=checkpoint.stem, every=2)
-    assert some.dataset.shards("test") == [shard for shard in shards if shard % 2 == 0]
+    given = replace(all_of(root), split="test", checkpoint=checkpoint.stem)
+    every, some = (replace(given, shards=tuple(these)) for these in (shards, shards[:1]))
+    assert some.dataset.shards("test") == shards[:1]
     assert not some.dataset.files("labels", split="train")
     asked = {"checkpoint_id": checkpoint.stem, "split": "test"}
-    goals = [ask(replace(some, every=n), "betas", **asked)[0]["goals"] for n in (0, 1, 2)]
+    goals = [ask(choice, "betas", **asked)[0]["goals"] for choice in (given, every, some)]
     assert goals[0] == goals[1] > goals[2] > 0
     assert len(read_predictions(some.dataset, checkpoint.stem)) < len(
         read_predictions(whole, checkpoint.stem)
     )
     assert not any("one shard in" in said.value for said in page(root, "models").caption)
-    scenes = len(whole.read_rows("scenes", split="test"))
-    monkeypatch.setattr("dashboards.asking.SCENES", -(-scenes // 2))
+    monkeypatch.setattr("dashboards.asking.SCENES", 1)
     app = page(root, "models")
     assert not app.exception
-    assert any(f"one shard in 2 of the split, which has {scenes}" in s.value for s in app.caption)
+    scenes = len(whole.read_rows("scenes", split="test"))
+    assert any(f"one shard in {scenes} of each family" in said.value for said in app.caption)
 
 
 def test_the_first_figure_waits_for_nothing_heavy() -> None:
