@@ -66,6 +66,8 @@ class Scored:
     """What it learned from: scenes, and goals of each and a predicate (0: all)."""
     scene_goals: int | None
     steps: int | None
+    minutes: float | None
+    """Of a core, that it was given; `core_minutes` are those that it took."""
     core_minutes: float | None
     scenes_shown: int | None
     asked: int | None
@@ -162,6 +164,7 @@ def _figures(
         "scenes": row["scenes"],
         "scene_goals": row["scene_goals"],
         "steps": row["steps"],
+        "minutes": row["minutes"],
         "core_minutes": row["core_seconds"] / 60,
         "scenes_shown": row["scenes_shown"],
         "asked": asked,
@@ -420,22 +423,26 @@ def _plots(study: str, rows: Sequence[Row], scored: Sequence[Scored]) -> Iterato
             panels=1 + len(curves.families_of(mine)),
         )
     networks = [asdict(one) for one in _of_families(scored) if one.judge == NETWORK]
-    longest = max((row["core_minutes"] for row in networks), default=0.0)
-    for by, title in (("scenes", "scenes to learn from"), ("core_minutes", "minutes of a core")):
-        rows_by = [
-            row | {"line": _line_of(row, by), by: round(row[by], 1)}
-            for row in networks
-            if by != "scenes" or row["core_minutes"] > 0.8 * longest
-        ]
-        if len({row[by] for row in rows_by if row["recipe"] == "long"}) > 2:
-            yield Plot(
-                name=f"{study}-by-{by.replace('_', '-')}",
-                draw=partial(curves.data, rows=rows_by, by=by, title=title),
-                panels=len({row["group"] for row in rows_by}),
-            )
+    yield from _more(study, networks, "scenes", "scenes to learn from", same="minutes")
+    yield from _more(study, networks, "minutes", "minutes of a core", same="scenes")
 
 
-def _line_of(row: Row, by: str) -> str:
+def _more(study: str, networks: Sequence[Row], by: str, title: str, *, same: str) -> Iterator[Plot]:
+    """What more of something brought, a line a kind of network, where some had three amounts."""
+    rows = [{**row, "line": _line_of(row, same)} for row in networks if row["recipe"] == "long"]
+    lines = dict.fromkeys(row["line"] for row in rows)
+    amounts = {line: {row[by] for row in rows if row["line"] == line} for line in lines}
+    rows = [row for row in rows if len(amounts[row["line"]]) > 1]
+    if any(len(its) > 2 for its in amounts.values()):
+        yield Plot(
+            name=f"{study}-by-{by}",
+            draw=partial(curves.data, rows=rows, by=by, title=title),
+            panels=len({row["group"] for row in rows}),
+        )
+
+
+def _line_of(row: Row, same: str) -> str:
+    """Body, goals, and what is the same along the line."""
     goals = {0: "all goals", 1: "1 goal"}.get(row["scene_goals"], f"{row['scene_goals']} goals")
-    goals = f"{goals} of each"
-    return f"{row['body']}, {goals}" + (f", {row['scenes']:,} scenes" if by != "scenes" else "")
+    amount = f"{row['scenes']:,} scenes" if same == "scenes" else f"{row['minutes']:g} minutes"
+    return f"{row['body']}, {goals} of each, {amount}"

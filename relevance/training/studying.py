@@ -145,6 +145,7 @@ def _write(plan: Plan, names: Mapping[str, str]) -> list[Row]:
         if file.exists():
             head = {"study": plan.study, "run": run.name}
             head |= {name: getattr(run, name) for name in ("label", "recipe", "curve", "ship")}
+            head |= {"minutes": plan.seconds(run) / 60}
             rows.append({**head, **json.loads(file.read_text())})
     with replacing(plan.table) as temporary:
         temporary.write_text("".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -232,29 +231,18 @@ def _saved(*axes: Axes, found: Curves) -> None:
                 markersize=4.5,
                 label="false irrelevant, the paper's",
             )
-            ax.set_ylim(*paper().axes["saved"])
-        else:
-            shown = [*values, *lost, *paper().axes["saved"]]
-            ax.set_ylim(min(shown) - 0.03, max(shown) + 0.03)
-        _say_outside(ax, {"the look paid": paid, "the look not paid": values})
+        shown = [*values, *lost, *paper().axes["saved"]]
+        shown += [row[end] for row in rows for end in ("saved_free_low", "saved_free_high")]
+        ax.set_ylim(min(shown) - 0.02, max(shown) + 0.02)
+        if max(paid) < ax.get_ylim()[0]:
+            text = f"the look paid: below, at {_ends(paid)}"
+            ax.text(0.98, 0.93, text, transform=ax.transAxes, ha="right", color=MUTED, fontsize=8)
     axes[0].figure.legend(
         loc="outside lower center",
         ncols=3,
         columnspacing=1.2,
         handles=axes[0].get_legend_handles_labels()[0],
     )
-
-
-def _say_outside(ax: Axes, lines: Mapping[str, Sequence[float]]) -> None:
-    """In words, what lies beyond the axes altogether."""
-    low, high = ax.get_ylim()
-    for name, values in lines.items():
-        if max(values) < low:
-            text = f"{name}: below, at {_ends(values)}"
-            ax.text(0.98, 0.03, text, transform=ax.transAxes, ha="right", color=MUTED, fontsize=8)
-        elif min(values) > high:
-            text = f"{name}: above, at {_ends(values)}"
-            ax.text(0.98, 0.93, text, transform=ax.transAxes, ha="right", color=MUTED, fontsize=8)
 
 
 def _dress(ax: Axes, panel: str) -> None:

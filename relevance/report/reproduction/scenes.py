@@ -93,7 +93,7 @@ def stacked_pair(dataset: Dataset) -> tuple[Drawing, str] | None:
     if len(rows) < 2:
         return None
     given = {"pair": [(_sample(dataset, row), row) for row in rows]}
-    drawing = Drawing(name="figure-4", draw=_pair, size=(9.2, 3.1), widths=(1.0, 1.0), given=given)
+    drawing = Drawing(name="figure-4", draw=_pair, size=(9.2, 3.4), widths=(1.0, 1.0), given=given)
     must, need_not = rows
     same = must["scene_id"] == need_not["scene_id"] and must["reference"] == need_not["reference"]
     return drawing, (
