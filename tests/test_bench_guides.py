@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gc
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -23,8 +24,10 @@ from relevance.benchmarks import (
 from relevance.benchmarks.guides import ROWS, Tasks
 from relevance.cli import main
 from relevance.errors import RelevanceError
+from relevance.evaluation.pairing import timed
 from relevance.planner import PLANNERS, Counts, PlannerConfig, PlanResult, Seconds, ask
 from relevance.planner.guides import rounds
+from relevance.scene import Box, Scene
 
 SETTINGS = Settings(
     seed=5,
@@ -301,3 +304,25 @@ def test_a_miss_of_another_planner_costs_its_unguided_run(slow, tmp_path):
 def test_guides_that_order_our_search_are_refused_for_another_planner():
     with pytest.raises(BenchmarkError, match="order orders our search"):
         Settings(seed=1, by="rai", guides=("order",))
+
+
+def test_no_garbage_is_collected_while_the_time_runs() -> None:
+    ours, collecting = PLANNERS["ours"], []
+
+    def plan(*asked, **more):
+        collecting.append(gc.isenabled())
+        if len(collecting) > 1:
+            raise RelevanceError("broken")
+        return ours.plan(*asked, **more)
+
+    box = {"size": (0.05, 0.05, 0.06), "yaw": 0.0, "color": (0.5, 0.5, 0.5)}
+    near, far = ((0.05, y, 0.03) for y in (-0.1, 0.2))
+    boxes = (Box(name="red", position=near, **box), Box(name="blue", position=far, **box))
+    scene = Scene(id="s", objects=boxes)
+    goal = scene.goal("on-the-left(red, blue)")
+    assert timed(SimpleNamespace(plan=plan), scene, goal, PlannerConfig()).solved
+    assert gc.isenabled()
+    with pytest.raises(RelevanceError, match="broken"):
+        timed(SimpleNamespace(plan=plan), scene, goal, PlannerConfig())
+    assert collecting == [False, False]
+    assert gc.isenabled()
