@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
-import pytest
+from filelock import FileLock
 from hypothesis import settings
 
 from relevance.pipeline import (
@@ -28,6 +28,39 @@ from relevance.sampling import SceneConfig
 settings.register_profile("ci", derandomize=True, deadline=None)
 if os.environ.get("CI"):
     settings.load_profile("ci")
+
+# --- what the test processes share --------------------------------------------------------------
+
+FOLDER = "RELEVANCE_TEST_FOLDER"
+_MADE: list[str] = []
+
+
+def pytest_configure() -> None:
+    """Make the folder that the test processes share, in the first of them."""
+    if FOLDER not in os.environ:
+        _MADE.append(tempfile.mkdtemp(prefix="relevance-test-"))
+        os.environ[FOLDER] = _MADE[0]
+
+
+def pytest_unconfigure() -> None:
+    """Remove it, in the process that made it."""
+    for folder in _MADE:
+        shutil.rmtree(folder)
+        del os.environ[FOLDER]
+    _MADE.clear()
+
+
+def shared(name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that is made by whichever test process asks first; read only."""
+    folder = Path(os.environ[FOLDER]) / name
+    done = folder.with_name(f"{name}.done")
+    with FileLock(f"{folder}.lock"):
+        if not done.exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of a process that died
+            make(folder)
+            done.touch()
+    return folder
+
 
 CONFIG = DatasetConfig(
     seed=3,
@@ -53,15 +86,7 @@ def make(root: Path, config: DatasetConfig = CONFIG) -> Path:
 @cache
 def small_dataset() -> Path:
     """A finished dataset of CONFIG, made once; copy it before you change it."""
-    return make(Path(tempfile.mkdtemp(prefix="relevance-test-")) / "dataset")
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _cleanup() -> Iterator[None]:
-    yield
-    for maker in (small_dataset, grown_dataset):
-        if maker.cache_info().currsize:
-            shutil.rmtree(maker().parent)
+    return shared("small", make)
 
 
 GROWN = DatasetConfig(
@@ -97,7 +122,7 @@ def done(*works: Work) -> None:
 @cache
 def grown_dataset() -> Path:
     """A finished dataset of GROWN, made once; copy it before you change it."""
-    return complete(Path(tempfile.mkdtemp(prefix="relevance-test-")) / "dataset")
+    return shared("grown", complete)
 
 
 def contents(root: Path) -> dict[str, bytes]:

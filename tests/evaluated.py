@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+
+from conftest import shared
 
 from relevance.evaluation import EvaluationConfig, evaluate, predict
 from relevance.pipeline import (
@@ -43,23 +44,19 @@ def label(root: Path) -> Path:
 @cache
 def labelled() -> Path:
     """A dataset without a checkpoint; read only."""
-    return label(_folder("labelled"))
+    return shared("labelled", label)
 
 
 @cache
 def evaluated() -> tuple[Path, Path]:
     """A dataset with predictions and reruns, and its checkpoint; read only."""
-    root = label(_folder("evaluated"))
-    checkpoint = train(root, TRAINING)
-    predict(root, checkpoint)
-    evaluate(root, checkpoint, EVALUATION)
+    root = shared("evaluated", _evaluate)
+    [checkpoint] = (root / "checkpoints").glob("*.pt")
     return root, checkpoint
 
 
-def _folder(name: str) -> Path:
-    # Lives until the process ends, as the cached datasets do.
-    _FOLDERS.append(tempfile.TemporaryDirectory())
-    return Path(_FOLDERS[-1].name) / name
-
-
-_FOLDERS: list[tempfile.TemporaryDirectory[str]] = []
+def _evaluate(root: Path) -> None:
+    label(root)
+    checkpoint = train(root, TRAINING)
+    predict(root, checkpoint)
+    evaluate(root, checkpoint, EVALUATION)
