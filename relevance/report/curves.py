@@ -57,7 +57,7 @@ def learning(*axes: Axes, rows: Sequence[Row]) -> None:
         if base is not None:
             ax.axhline(base, color=FAINT, linewidth=1.2)
             ax.text(0, base, " always irrelevant", color=GREY, fontsize=8, va="bottom")
-        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{round(100 * value, 1):g}%"))
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{round(100 * value, 2):g}%"))
     for ax in axes:
         ax.set_xlabel("minutes of a core")
         ax.set_xlim(left=0)
@@ -117,7 +117,7 @@ def data(*axes: Axes, rows: Sequence[Row], by: str, title: str) -> None:
         ax.set_xlabel(title)
         low = min(row["total"] for row in rows if row["group"] == family)
         ax.set_ylim(bottom=max(base, low) - 0.01)
-        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{round(100 * value, 1):g}%"))
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{round(100 * value, 2):g}%"))
     axes[0].set_ylabel("test queries judged rightly")
     _legend_below(axes[0])
 

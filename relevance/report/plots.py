@@ -172,7 +172,7 @@ def reasons(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
         ax.text(count + max(counts) * 0.01, at, f"{count:,}", va="center", fontsize=8.5)
     ax.set_yticks(y, [textwrap.fill(row["label"], 26) for row in rows])
     ax.set_xlim(0, max(counts) * 1.12)
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     ax.grid(axis="y", visible=False)
     ax.set_xlabel("tasks")
 
