@@ -109,12 +109,13 @@ def sampled(given: Choice) -> Choice:
     """The split, or every so-manieth shard of each of its families where it is large."""
     scenes = ask(given, "scene_totals", splits=[given.split])[0]["scenes"]
     every = max(1, round(scenes / SCENES))
-    if every == 1:
+    judging = ask(given, "judged_shards", split=given.split, every=every) if every > 1 else []
+    seen = sum(row["scenes"] for row in judging)
+    if seen in (0, scenes):
         return given
-    judging = ask(given, "judged_shards", split=given.split, every=every)
     st.caption(
-        f"Judged by one shard in {every} of each family, {sum(row['scenes'] for row in judging):,} "
-        f"of {scenes:,} scenes."
+        f"Judged by one shard in {every} of each family (at least one): {seen:,} of {scenes:,} "
+        "scenes."
     )
     return replace(given, shards=tuple(row["shard"] for row in judging))
 

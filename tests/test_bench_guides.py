@@ -326,3 +326,10 @@ def test_no_garbage_is_collected_while_the_time_runs() -> None:
         timed(SimpleNamespace(plan=plan), scene, goal, PlannerConfig())
     assert collecting == [False, False]
     assert gc.isenabled()
+    gc.disable()
+    try:
+        with pytest.raises(RelevanceError, match="broken"):
+            timed(SimpleNamespace(plan=plan), scene, goal, PlannerConfig())
+        assert not gc.isenabled()
+    finally:
+        gc.enable()

@@ -128,14 +128,17 @@ def test_some_shards_of_each_family_stand_for_a_large_split() -> None:
         plain.execute("CREATE TABLE scenes (split VARCHAR, shard INTEGER, family VARCHAR)")
         for shard, family in shards.items():
             plain.execute("INSERT INTO scenes VALUES ('test', ?, ?)", [shard, family])
-        plain.execute("INSERT INTO scenes VALUES ('train', 4, 'apart')")
+        plain.execute("INSERT INTO scenes VALUES ('train', 4, 'apart'), ('train', 2, 'apart')")
+        plain.execute(
+            "CREATE VIEW shard_families AS SELECT DISTINCT split, shard, family FROM scenes"
+        )
         text = (SQL / "judged_shards.sql").read_text()
         for every, expected in ((1, list(shards)), (2, [0, 1, 3, 5]), (9, [0, 1, 3])):
             plain.execute("SET VARIABLE every = ?", [every])
             assert [row[0] for row in plain.execute(text).fetchall()] == expected
 
 
-def test_of_a_large_split_some_shards_are_judged(page, monkeypatch) -> None:
+def test_what_is_not_looked_at_is_not_seen() -> None:
     root, checkpoint = evaluated()
     whole = Dataset.open(root)
     shards = whole.shards("test")
@@ -150,12 +153,29 @@ def test_of_a_large_split_some_shards_are_judged(page, monkeypatch) -> None:
     assert len(read_predictions(some.dataset, checkpoint.stem)) < len(
         read_predictions(whole, checkpoint.stem)
     )
-    assert not any("one shard in" in said.value for said in page(root, "models").caption)
+
+
+def test_pages_that_judge_look_at_some_shards_of_a_large_split(page, monkeypatch, tmp_path) -> None:
+    root = Path(shutil.copytree(evaluated()[0], tmp_path / "large"))
+    dataset = Dataset.open(root)
+    shards = dataset.shards("test")
+    rows = dataset.read_rows("scenes", split="test")
+    scenes = len(rows)
+    more = [
+        row | {"scene_id": f"{row['scene_id']}-2", "shard": 99}
+        for row in rows
+        if row["shard"] == shards[0]
+    ]
+    dataset.write_rows("scenes", more, split="test", shard=99, made_by={"config": "c"})
+    app = page(root, "models")
+    assert set(app.session_state["choice"].shards) == {*shards, 99}
+    assert not any("one shard in" in said.value for said in app.caption)
     monkeypatch.setattr("dashboards.asking.SCENES", 1)
     app = page(root, "models")
     assert not app.exception
-    scenes = len(whole.read_rows("scenes", split="test"))
-    assert any(f"one shard in {scenes} of each family" in said.value for said in app.caption)
+    assert app.session_state["choice"].shards == tuple(shards)
+    said = f"{scenes} of {scenes + len(more)} scenes"
+    assert any(said in caption.value for caption in app.caption)
 
 
 def test_the_first_figure_waits_for_nothing_heavy() -> None:

@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 import torch
 from conftest import small_dataset
+from matplotlib.figure import Figure
 from ruled import ruled
 
-from relevance.benchmarks.studies import at_share, markdown, tabulate
+from relevance.benchmarks.studies import _more, at_share, markdown, tabulate
 from relevance.cli import main
 from relevance.errors import RelevanceError
 from relevance.evaluation import (
@@ -383,3 +384,26 @@ def test_the_command_writes_tables_and_pictures(tiny: str, tmp_path: Path, capsy
     assert (out / "tiny.md").read_text() == before
     assert main(["study", str(root), "soup"]) == 2
     assert "unknown study 'soup'" in capsys.readouterr().err
+
+
+def test_more_of_something_is_drawn_where_three_amounts_are_known() -> None:
+    def row(body: str, scenes: int, minutes: float, recipe: str = "long") -> dict[str, Any]:
+        found = {"body": body, "scenes": scenes, "minutes": minutes, "recipe": recipe}
+        return found | {"scene_goals": 0, "group": "on", "total": 0.9, "base_rate": 0.7}
+
+    def drawn(rows: list[dict[str, Any]], by: str, same: str) -> dict[str, set[str]]:
+        lines = {}
+        for plot in _more("tried", rows, by, by, same=same):
+            axes = Figure().subplots(1, plot.panels, squeeze=False)[0]
+            plot.draw(*axes)
+            lines[plot.name] = set(axes[0].get_legend_handles_labels()[1])
+        return lines
+
+    rows = [row("geometry", scenes, 10.0) for scenes in (100, 200, 400)]
+    rows += [row("geometry", 400, 5.0), row("glimpse", 400, 10.0), row("vit", 100, 10.0, "fair")]
+    ten = {"geometry, all goals of each, 10 minutes"}
+    assert drawn(rows, "scenes", "minutes") == {"tried-by-scenes": ten}
+    assert drawn(rows, "minutes", "scenes") == {}
+    rows.append(row("geometry", 400, 2.5))
+    all_of_them = {"geometry, all goals of each, 400 scenes"}
+    assert drawn(rows, "minutes", "scenes") == {"tried-by-minutes": all_of_them}
