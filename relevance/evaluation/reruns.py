@@ -25,7 +25,7 @@ from relevance.planner import GUIDES, PLANNER_VERSION, PlannerConfig, Scorer
 from relevance.scene import PREDICATES, Goal, Scene
 from relevance.store import Dataset
 
-EVALUATION_VERSION = "4"
+EVALUATION_VERSION = "5"
 """Raised when rows of equal settings would come out otherwise."""
 OWN = "checkpoint"
 """What rows call the prior that is the checkpoint itself."""
