@@ -61,7 +61,7 @@ BODIES.register(
     BodyKind(
         config=GeometryConfig,
         make=GeometryBody,
-        version="2",
+        version="3",
         advantage="is told the true poses of all objects and sees no picture",
     ),
 )

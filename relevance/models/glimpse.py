@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from relevance.configs import config
 from relevance.models.config import PATCH, STRIDE, Encoding, ModelConfig, Sight, divides
 from relevance.models.layers import Attention, columns, small_cnn, unshuffled
-from relevance.models.reasoning import BETWEEN, Between, Thinker
+from relevance.models.reasoning import APART, BETWEEN, Between, Thinker, apart
 from relevance.models.registry import BODIES, BodyKind
 from relevance.models.tracing import sums, tracing, windows
 from relevance.networks import DECIMETRE, GEOMETRY
@@ -89,7 +89,7 @@ class GlimpseBody(Thinker):
         seen = 2 * width + 4
         self.estimate = nn.Sequential(nn.Linear(seen, width), nn.GELU(), nn.Linear(width, GEOMETRY))
         self.seen = nn.Sequential(nn.Linear(seen + GEOMETRY, width), nn.GELU())
-        self.between = Between()
+        self.between = Between(APART)
         self.settle = nn.ModuleList(
             Attention(width, config.heads, expansion=2, between=BETWEEN) for _ in range(2)
         )
@@ -122,7 +122,7 @@ class GlimpseBody(Thinker):
         geometry = self.estimate(seen).float()
         geometry = torch.cat([geometry[..., :2] + ground_BN2, geometry[..., 2:]], dim=-1)
         x = self.seen(torch.cat([seen, geometry], dim=-1))
-        allowed, between = columns(present), self.between(geometry)
+        allowed, between = columns(present), self.between(apart(geometry))
         for layer in self.settle:
             x = layer(x, allowed, between)
         geometry = geometry + self.correct(x).float()
@@ -189,7 +189,7 @@ BODIES.register(
     BodyKind(
         config=GlimpseConfig,
         make=GlimpseBody,
-        version="3",
+        version="4",
         advantage="sees the views of all objects, and learned from masks and poses",
     ),
 )

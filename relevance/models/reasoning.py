@@ -13,35 +13,39 @@ from torch import Tensor, nn
 
 from relevance.models.config import Answer, Encoding
 from relevance.models.layers import Attention, columns, pick
+from relevance.models.obstruction import (
+    OBSTRUCTION,
+    ROBOT,
+    obstructed_goals,
+    obstructed_picks,
+)
 from relevance.models.registry import Body
 from relevance.models.tracing import tracing
 from relevance.networks import ANGLES, GEOMETRY
-from relevance.scene import Predicate, Robot
+from relevance.scene import Predicate
 
-ROBOT = Robot()
-"""Whose axes the directions of goals are: every picture was taken in front of this one."""
 GOAL_FEATURES = 3 * GEOMETRY + 2 + 2 * 8
-BETWEEN_FEATURES = 3 + ANGLES + 1 + 2
+APART = 3 + ANGLES + 1 + 2
 BETWEEN = 64
 """Width of what lies between two objects."""
 
 
 class Between(nn.Module):
-    """What lies between every two objects: whether one is in the way of the hand at another."""
+    """What is made of what lies between every two objects."""
 
-    def __init__(self) -> None:
+    def __init__(self, features: int) -> None:
         super().__init__()
         self.net = nn.Sequential(
-            nn.Linear(BETWEEN_FEATURES, BETWEEN), nn.GELU(), nn.Linear(BETWEEN, BETWEEN), nn.GELU()
+            nn.Linear(features, BETWEEN), nn.GELU(), nn.Linear(BETWEEN, BETWEEN), nn.GELU()
         )
 
-    def forward(self, geometry: Tensor) -> Tensor:
-        """(B, N, N, BETWEEN), row from column, from geometry (B, N, GEOMETRY)."""
-        return self.net(between_features(geometry))
+    def forward(self, *features: Tensor) -> Tensor:
+        """(B, N, N, BETWEEN), row from column, from features (B, N, N, some) side by side."""
+        return self.net(torch.cat(features, dim=-1))
 
 
-def between_features(geometry: Tensor) -> Tensor:
-    """How each object (row) stands to each other (column), (B, N, N, BETWEEN_FEATURES).
+def apart(geometry: Tensor) -> Tensor:
+    """How each object (row) stands to each other (column), (B, N, N, APART).
 
     Offset of the centres, gap of the footprints along ANGLES directions (negative where their
     shadows overlap) and the widest of these, heights of the column's top and bottom over the
@@ -64,12 +68,12 @@ class Reasoning(nn.Module):
     def __init__(self, width: int, heads: int, layers: int, predicates: Sequence[str]) -> None:
         super().__init__()
         self.place = nn.Sequential(
-            nn.Linear(GOAL_FEATURES, width), nn.GELU(), nn.Linear(width, width)
+            nn.Linear(GOAL_FEATURES + OBSTRUCTION, width), nn.GELU(), nn.Linear(width, width)
         )
         self.predicate = nn.ParameterDict(
             {name: nn.Parameter(torch.zeros(width)) for name in predicates}
         )
-        self.between = Between()
+        self.between = Between(APART + 2 * OBSTRUCTION)
         self.layers = nn.ModuleList(
             Attention(width, heads, expansion=2, between=BETWEEN) for _ in range(layers)
         )
@@ -78,6 +82,8 @@ class Reasoning(nn.Module):
         """Tokens (B, G, N, D) from what is known of a scene and its objects."""
         assert encoding.geometry is not None
         features = goal_features(encoding.geometry, predicate, goals)
+        places = obstructed_goals(encoding.geometry, encoding.present, predicate, goals)
+        features = torch.cat([features, places], dim=3)
         x_BGND = encoding.tokens[:, None] + self.place(features) + self.predicate[predicate.name]
         x = x_BGND[0] if tracing() else x_BGND.flatten(0, 1)
         allowed = columns(encoding.present)
@@ -108,7 +114,9 @@ class Thinker(Body):
     def thought(self, tokens: Tensor, present: Tensor, geometry: Tensor) -> Encoding:
         """What is known of each object, tokens (B, N, D), and where it is, (B, N, GEOMETRY)."""
         tokens = self.among(tokens, columns(present))
-        between = self.reason.between(geometry)  # the same for all goals of the scene
+        # The same for all goals of the scene; in the way of the row's pick, then of the column's.
+        picks = obstructed_picks(geometry, present)
+        between = self.reason.between(apart(geometry), picks, picks.transpose(1, 2))
         return Encoding(tokens=tokens, present=present, geometry=geometry, between=between)
 
     def decode(
@@ -116,7 +124,7 @@ class Thinker(Body):
     ) -> Answer:
         """As `RelevanceModel.answer`."""
         x = self.reason(encoding, predicate, goals)
-        return Answer(scores=self.heads[predicate.name](x).squeeze(-1))
+        return Answer(scores=self.heads[predicate.name](x)[..., 0])
 
 
 def object_heads(width: int, predicates: Sequence[str]) -> nn.ModuleDict:

@@ -113,5 +113,6 @@ def shares(x_BLD: Tensor, qkv: nn.Linear, heads: int, say: Tensor) -> tuple[Tens
     """
     each = qkv.in_features // heads
     q, k, v = reshaped(qkv(x_BLD), (0, -1, 3, heads, each)).permute(2, 0, 3, 1, 4)
-    share = (q @ k.transpose(2, 3) / math.sqrt(each) + say).softmax(-1)
+    logits = q @ k.transpose(2, 3) / math.sqrt(each) + say
+    share = logits.softmax(3)  # not -1: the exporter may have lost count of the dimensions
     return share, reshaped((share @ v).transpose(1, 2), (0, 0, -1))

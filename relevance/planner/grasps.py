@@ -144,7 +144,7 @@ def leaning_grasps(box: Box) -> Family:
 
 @lru_cache(maxsize=1024)
 def _family(size: tuple[float, float, float], number: int) -> Family:
-    hand, ways = _hand(), _WAYS[number]
+    hand, ways = hand_boxes(), _WAYS[number]
     most = 2 * len(ways)
     axes, rows = np.empty(most, np.int64), np.empty((most, COLUMNS))
     parts = np.empty((most, 1 + len(hand.shape), 5))
@@ -157,7 +157,7 @@ def _family(size: tuple[float, float, float], number: int) -> Family:
 
 def fits(box: Box) -> bool:
     """Whether the hand opens wide enough for one of its edges."""
-    return min(box.size[:2]) / 2 + SPREAD <= _hand().max_opening
+    return min(box.size[:2]) / 2 + SPREAD <= hand_boxes().max_opening
 
 
 def pick_target(box: Box, grasp: Grasp) -> np.ndarray:
@@ -244,7 +244,7 @@ def _bodies(rows: list[tuple[int, np.ndarray, np.ndarray]]) -> Bodies:
     return Bodies(link, centre, half, np.zeros(len(link)), np.sqrt((half**2).sum(1)))
 
 
-class _Hand(NamedTuple):
+class HandBoxes(NamedTuple):
     """The hand as boxes along its axes: the finger tips, the fingers, the halves of the palm."""
 
     shape: np.ndarray
@@ -256,7 +256,7 @@ class _Hand(NamedTuple):
 
 
 @cache
-def _hand() -> _Hand:
+def hand_boxes() -> HandBoxes:
     arm, boxes = panda(), []
     for low, high in arm.finger:
         for side in (1.0, -1.0):
@@ -274,4 +274,4 @@ def _hand() -> _Hand:
         columns = middle, (left + right) / 2, along, (right - left) / 2, under
         over.append(np.column_stack(columns))
     shape = np.column_stack([across, near, sides])
-    return _Hand(shape, np.array(over), arm.finger_tip, arm.max_opening)
+    return HandBoxes(shape, np.array(over), arm.finger_tip, arm.max_opening)
