@@ -25,6 +25,8 @@ from relevance.models.tracing import sums, tracing, windows
 from relevance.networks import DECIMETRE, GEOMETRY
 from relevance.scene import Camera, camera_up
 
+_FINE = 2 * PATCH
+"""Samples along the edge of a window, which has as many pixels: a box is placed by its edges."""
 _GROUND = 0.035
 """Height at which a sight line is cut for a first guess of the position, m: half a box."""
 
@@ -43,8 +45,8 @@ class GlimpseConfig(ModelConfig):
     """Attention layers over the objects given the goal."""
     channels: Annotated[int, Field(ge=2)] = 32
     """E, channels of the stride-4 feature map."""
-    window: Annotated[int, Field(ge=1)] = 56
-    """Edge of the image window around a matched object, pixels."""
+    window: Annotated[int, Field(ge=1)] = 64
+    """Edge of the image window around a matched object, pixels; looked at by 64 samples."""
 
     @model_validator(mode="after")
     def _even(self) -> Self:
@@ -85,7 +87,7 @@ class GlimpseBody(Thinker):
         self.view = small_cnn(3, (channels // 2, channels, channels), width)
         self.view_key = nn.Linear(width, channels)
         self.sharpness = nn.Parameter(torch.tensor(2.5))
-        self.look = small_cnn(4, (24, 48, 64), width)
+        self.look = small_cnn(3 * 4 + 1, (24, 48, 64), width)
         seen = 2 * width + 4
         self.estimate = nn.Sequential(nn.Linear(seen, width), nn.GELU(), nn.Linear(width, GEOMETRY))
         self.seen = nn.Sequential(nn.Linear(seen + GEOMETRY, width), nn.GELU())
@@ -137,27 +139,35 @@ class GlimpseBody(Thinker):
         return encoding
 
     def _window(self, image: Tensor, where_BNP: Tensor, centre_BN2: Tensor) -> Tensor:
-        """Windows around the centres, (B*N, 4, 32, 32): colours and match map."""
+        """Windows around the centres, (B*N, 13, 32, 32): colours of four samples, and match map."""
         batch, objects = where_BNP.shape[:2]
         height, width = image.shape[-2:]
         if tracing():
             map_NHW = where_BNP[0].unflatten(-1, (height // STRIDE, width // STRIDE))
             peak, _ = windows(map_NHW[:, None], centre_BN2[0], self.window / STRIDE, own=True)
-            colours, inside = windows(image, centre_BN2[0], self.window, own=False)
+            colours, inside = windows(image, centre_BN2[0], self.window, own=False, samples=_FINE)
             highest = where_BNP[0].amax(-1)[:, None, None, None]
-            return torch.cat([colours - inside / 2, peak / highest], dim=1)
-        step = (torch.arange(PATCH, device=image.device) + 0.5) / PATCH * 2 - 1
-        offset = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1)
-        offset = offset * offset.new_tensor([self.window / width, self.window / height])
-        grid = centre_BN2[:, :, None, None] + offset
-        colours = F.grid_sample(
-            image - 0.5, grid.view(batch, objects * PATCH, PATCH, 2), align_corners=False
+            fine = F.pixel_unshuffle(colours - inside / 2, 2)
+            return torch.cat([fine, peak / highest], dim=1)
+        edge = image.new_tensor([self.window / width, self.window / height])
+        fine, coarse = (
+            centre_BN2[:, :, None, None] + _square(n, image.device) * edge for n in (_FINE, PATCH)
         )
-        colours = colours.view(batch, 3, objects, PATCH, PATCH).transpose(1, 2)
+        colours = F.grid_sample(
+            image - 0.5, fine.view(batch, objects * _FINE, _FINE, 2), align_corners=False
+        )
+        colours = colours.view(batch, 3, objects, _FINE, _FINE).transpose(1, 2)
         shape = (batch * objects, 1, height // STRIDE, width // STRIDE)
         peak = (where_BNP / where_BNP.amax(-1, keepdim=True)).view(shape)
-        heat = F.grid_sample(peak, grid.view(-1, PATCH, PATCH, 2), align_corners=False)
-        return torch.cat([colours.reshape(-1, 3, PATCH, PATCH), heat], dim=1)
+        heat = F.grid_sample(peak, coarse.view(-1, PATCH, PATCH, 2), align_corners=False)
+        fine = F.pixel_unshuffle(colours.reshape(-1, 3, _FINE, _FINE), 2)
+        return torch.cat([fine, heat], dim=1)
+
+
+def _square(count: int, device: torch.device) -> Tensor:
+    """Centres of count x count cells of a square, (count, count, 2): u and v, each in -1..1."""
+    step = (torch.arange(count, device=device) + 0.5) / count * 2 - 1
+    return torch.stack(torch.meshgrid(step, step, indexing="xy"), -1)
 
 
 def _cell_centres(camera: Camera) -> Tensor:

@@ -33,17 +33,17 @@ def sums(x_BEK: Tensor) -> Tensor:
 
 
 def windows(
-    maps_MCHW: Tensor, centre_N2: Tensor, edge: float, *, own: bool
+    maps_MCHW: Tensor, centre_N2: Tensor, edge: float, *, own: bool, samples: int = PATCH
 ) -> tuple[Tensor, Tensor]:
-    """Squares around centres (u and v in -1..1), resampled: (N, C, PATCH, PATCH).
+    """Squares around centres (u and v in -1..1), resampled: (N, C, S, S).
 
     Of the one map, or of each object's own. And how much of each sample is inside of the map,
-    (N, 1, PATCH, PATCH): outside is nothing. Samples lie on rows and columns, so that a square is
+    (N, 1, S, S): outside is nothing. Samples lie on rows and columns, so that a square is
     a small part of the map, copied in tiles, between two small matrices; GridSample takes twice
     as long.
     """
     channels, height, width = maps_MCHW.shape[1:]
-    step_S = ((torch.arange(PATCH) + 0.5) / PATCH - 0.5) * edge - 0.5
+    step_S = ((torch.arange(samples) + 0.5) / samples - 0.5) * edge - 0.5
     middle_N2 = (centre_N2 + 1) * torch.tensor([width / 2, height / 2])
     x_NS, y_NS = (middle_N2[:, axis, None] + step_S for axis in range(2))
     rows = min(int(edge) + 2, height)
@@ -60,7 +60,7 @@ def windows(
     cut = maps_MCHW.reshape(-1, _TILE)[place_NK].view(-1, channels * rows, tiles * _TILE)
     across_NSR = _taps(x_NS - x_N1 * _TILE, tiles * _TILE)
     down_NSR = _taps(y_NS - y_N1, rows)
-    cut = (cut @ across_NSR.transpose(1, 2)).view(-1, channels, rows, PATCH)
+    cut = (cut @ across_NSR.transpose(1, 2)).view(-1, channels, rows, samples)
     inside = down_NSR.sum(-1)[:, None, :, None] * across_NSR.sum(-1)[:, None, None]
     return down_NSR[:, None] @ cut, inside
 

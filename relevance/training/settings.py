@@ -155,7 +155,7 @@ class TrainConfig:
     @classmethod
     def laptop(cls) -> Self:
         """About an hour of one core."""
-        return cls(preset="laptop", steps=15_000, learning_rate=1.5e-3, told_share=0.3)
+        return cls(preset="laptop", steps=15_000, learning_rate=1.5e-3, told_share=0.1)
 
     @classmethod
     def paper(cls) -> Self:
