@@ -1,7 +1,7 @@
 """No picture: the boxes' true poses, as a planner that knows its world has them.
 
-The ceiling of what the other bodies can reach with the same reasoning, and a guide of half a
-millisecond.
+The ceiling of what the other bodies can reach with the same reasoning, and a guide that needs no
+picture.
 """
 
 from __future__ import annotations
@@ -62,6 +62,6 @@ BODIES.register(
         config=GeometryConfig,
         make=GeometryBody,
         version="3",
-        advantage="is told the true poses of all objects and sees no picture",
+        advantage="is told the true poses of all objects, and reckons what is in the hand's way",
     ),
 )

@@ -200,6 +200,7 @@ BODIES.register(
         config=GlimpseConfig,
         make=GlimpseBody,
         version="4",
-        advantage="sees the views of all objects, and learned from masks and poses",
+        advantage="sees the views of all objects, learned from masks and poses, and reckons what "
+        "is in the hand's way where it sees them",
     ),
 )
