@@ -54,7 +54,7 @@ def _study(_: Preset) -> Callable[..., int]:
             models: Where what comes with the package is written to (study ship, study crowd).
         """
         from relevance.benchmarks.studies import markdown, tabulate
-        from relevance.evaluation import tune_once
+        from relevance.evaluation import calibrate, tune_once
         from relevance.store import replacing
         from relevance.training import Plan, TrainConfig, find_checkpoint, run_study, ship
 
@@ -75,7 +75,10 @@ def _study(_: Preset) -> Callable[..., int]:
                 with bar("tasks") as progress:
                     made = find_checkpoint(dataset, row["checkpoint_id"])
                     tune_once(dataset, made, progress=progress)
-                print(ship(dataset, config, models, name=row["ship"]))
+                path = ship(dataset, config, models, name=row["ship"])
+                with bar("shards scored") as progress:
+                    calibrate(dataset, path, progress=progress)
+                print(path)
         return 0
 
     return study
