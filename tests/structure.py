@@ -21,6 +21,7 @@ ORDER = (
     "counters",
     "workers",
     "robot",
+    "holding",
     "scene",
     "store",
     "networks",

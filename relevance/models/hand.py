@@ -1,4 +1,4 @@
-"""The hand around boxes, in tensors: the rectangles of `relevance.planner.grasps` and their gaps.
+"""The hand around boxes, in tensors: the rectangles of the planner's grasps and their gaps.
 
 The hand comes straight down over a box, across either pair of its edges, shifted along it or
 leaning; in the plane it is rectangles that begin at heights.
@@ -16,20 +16,20 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from relevance.networks import ANGLES, DECIMETRE
-from relevance.planner.grasps import hand_boxes
-from relevance.planner.kernels.holds import (
+from relevance.holding import (
     DEPTH,
     FARTHEST,
     GRIP,
     GROUND,
     INSET,
+    MARGIN,
     PALM_ROOM,
     SHALLOW,
     SPREAD,
     TILTS,
+    hand_boxes,
 )
-from relevance.planner.kernels.planar import MARGIN
+from relevance.networks import ANGLES, DECIMETRE
 
 FAR = 0.1
 """No gap counts for more, m."""

@@ -15,6 +15,7 @@ import math
 import torch
 from torch import Tensor
 
+from relevance.holding import MARGIN, PICK_MARGIN, REGION_MARGIN
 from relevance.models.hand import (
     BETWEEN_THEM,
     FAR,
@@ -30,8 +31,6 @@ from relevance.models.hand import (
 from relevance.models.layers import pick
 from relevance.models.tracing import reshaped
 from relevance.networks import ANGLES, DECIMETRE
-from relevance.planner.kernels.planar import MARGIN, PICK_MARGIN
-from relevance.planner.problem import REGION_MARGIN
 from relevance.scene import GAP, Predicate, Robot
 
 ROBOT = Robot()

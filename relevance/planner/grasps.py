@@ -20,12 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from relevance.holding import SHALLOW, SPREAD, TILTS, hand_boxes
 from relevance.planner.kernels.boxes import Bodies
 from relevance.planner.kernels.holds import (
     COLUMNS,
-    SHALLOW,
-    SPREAD,
-    TILTS,
     WRIST_ABOVE,
     WRIST_LEFT,
     sound_holds,
@@ -242,36 +240,3 @@ def _shut_hand(upper: bool) -> tuple[Bodies, np.ndarray]:
 def _bodies(rows: list[tuple[int, np.ndarray, np.ndarray]]) -> Bodies:
     link, centre, half = (np.array(column) for column in zip(*rows, strict=True))
     return Bodies(link, centre, half, np.zeros(len(link)), np.sqrt((half**2).sum(1)))
-
-
-class HandBoxes(NamedTuple):
-    """The hand as boxes along its axes: the finger tips, the fingers, the halves of the palm."""
-
-    shape: np.ndarray
-    """(P, 3): as `sound_holds` has it."""
-    over: np.ndarray
-    """(T, P, 5): likewise."""
-    tip: float
-    max_opening: float
-
-
-@cache
-def hand_boxes() -> HandBoxes:
-    arm, boxes = panda(), []
-    for low, high in arm.finger:
-        for side in (1.0, -1.0):
-            middle, across = side * (low[1] + high[1]) / 2, max(abs(low[0]), abs(high[0]))
-            boxes.append((middle, (high[1] - low[1]) / 2, across, high[2], low[2], side))
-    for _, centre, half in arm.arm[-2:]:
-        reach = np.abs(centre) + half
-        boxes.append((0.0, reach[1], reach[0], centre[2] + half[2], centre[2] - half[2], 0.0))
-    middle, along, across, low, high, sides = np.array(boxes).T
-    near, far, over = arm.finger_tip - low, arm.finger_tip - high, []
-    for s, c in ((math.sin(tilt), math.cos(tilt)) for tilt in TILTS):
-        left = np.minimum(near * s, far * s) - across * c
-        right = np.maximum(near * s, far * s) + across * c
-        under = near * c - across * abs(s)
-        columns = middle, (left + right) / 2, along, (right - left) / 2, under
-        over.append(np.column_stack(columns))
-    shape = np.column_stack([across, near, sides])
-    return HandBoxes(shape, np.array(over), arm.finger_tip, arm.max_opening)

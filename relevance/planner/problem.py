@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
+from relevance.holding import REGION_MARGIN
 from relevance.planner import logic
 from relevance.planner.kernels.kinematics import Arm, arm_at
 from relevance.planner.result import Counts, Seconds
@@ -21,8 +22,6 @@ from relevance.robot import panda
 from relevance.scene import Box, Goal, Rectangle, Scene, footprint_gap
 from relevance.scene.geometry import UPRIGHT, upright
 
-REGION_MARGIN = 0.0005
-"""How far inside the goal region a subject is placed, m."""
 LOW = 0.2
 """Height over the robot's base below which only the hand and the forearm can be, m."""
 CLOSE = 2e-4

@@ -11,24 +11,18 @@ import math
 
 from numba import njit
 
-DEPTH = 0.025
-"""How far the finger tips reach below the top of the box that they hold, at most, m."""
-SHALLOW = (0.012, 0.006)
-"""Smaller depths, m; a box is held as deep as its neighbours allow."""
-GRIP = 0.005
-"""Least height of the pads that lies on the face of a held box, m."""
-GROUND = 0.004
-"""What the finger tips keep from what the box stands on, m."""
-INSET = 0.005
-"""Least distance of the pads' middle line from the corner of a held box, m."""
-FARTHEST = 0.055
-"""Farthest that the hand is shifted along a box, m."""
-SPREAD = 0.002
-"""How far each finger stands off the box before it closes, m."""
-TILTS = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6)
-"""How far the hand may lean to the left of the finger axis, rad."""
-PALM_ROOM = 0.003
-"""What a leaning palm keeps from the box that it holds, m."""
+from relevance.holding import (
+    DEPTH,
+    FARTHEST,
+    GRIP,
+    GROUND,
+    INSET,
+    PALM_ROOM,
+    SHALLOW,
+    SPREAD,
+    TILTS,
+)
+
 PRICE = 20.0
 """Price of a hold for each metre that it is shallower, or farther from the middle, rad^2/m."""
 LEAN_PRICE = 3.0

@@ -14,12 +14,9 @@ import math
 import numpy as np
 from numba import njit
 
+from relevance.holding import MARGIN, PICK_MARGIN
 from relevance.scene.geometry import UPRIGHT, rectangle_gap, upright
 
-MARGIN = 0.003
-"""Clearance that placements keep, m; the later bounds ask for less, so they never refuse it."""
-PICK_MARGIN = 0.001
-"""Clearance of the gripper around a box that it takes, m."""
 COMFORT = 0.008
 """Clearance beyond MARGIN with which a pose is taken at once, m."""
 NODE_LIMIT = 4000
