@@ -10,6 +10,7 @@ Names are imported when first used, so that `import relevance` stays light.
 
 import hashlib
 import os
+import re
 import tempfile
 from contextlib import suppress
 from importlib import import_module
@@ -56,10 +57,16 @@ def _kernel_cache(package: Path) -> Path:
     """Where compiled kernels are kept: one folder for each content of all their sources.
 
     Left alone, numba looks for changes in a kernel's own file, not in those of the kernels that
-    it calls, and would go on with what was compiled of the old ones.
+    it calls or of the numbers that it was compiled with, and would go on with the old ones.
     """
-    sources = (file.read_bytes() for file in sorted(package.rglob("*.py")))
-    digest = hashlib.sha256(b"".join(text for text in sources if b"@njit" in text)).hexdigest()
+    sources = {file: file.read_bytes() for file in sorted(package.rglob("*.py"))}
+    kernels = b"".join(text for text in sources.values() if b"@njit" in text)
+    names = set(re.findall(rb"^from (relevance\.[\w.]+) import", kernels, re.MULTILINE))
+    for file, text in sources.items():
+        name = ".".join(("relevance", *file.relative_to(package).with_suffix("").parts))
+        if name.encode() in names and b"@njit" not in text:
+            kernels += text
+    digest = hashlib.sha256(kernels).hexdigest()
     return _caches() / "relevance" / f"kernels-{digest[:16]}"
 
 

@@ -413,6 +413,10 @@ def test_compiled_kernels_are_kept_by_the_content_of_all_their_sources(tmp_path)
     assert _kernel_cache(tmp_path) == before
     (tmp_path / "inner/b.py").write_text("@njit\ndef f(x): return 2 * x\n")
     assert _kernel_cache(tmp_path) != before
+    (tmp_path / "a.py").write_text("from relevance.plain import ROOM\n@njit\ndef f(x): return x\n")
+    before = _kernel_cache(tmp_path)
+    (tmp_path / "plain.py").write_text("ROOM = 0.002\n")
+    assert _kernel_cache(tmp_path) != before, "numbers are compiled in"
 
 
 def test_another_checkouts_kernels_are_not_inherited_but_the_users_folder_is(tmp_path):
