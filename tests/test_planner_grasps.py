@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from relevance.holding.holds import FARTHEST, GRIP, GROUND, INSET, TILTS
 from relevance.planner import PlannerConfig, plan, trajectory
 from relevance.planner.checking import broken
 from relevance.planner.grasps import (
@@ -18,7 +19,6 @@ from relevance.planner.grasps import (
     pick_target,
 )
 from relevance.planner.kernels.boxes import body_pose
-from relevance.planner.kernels.holds import FARTHEST, GRIP, GROUND, INSET, TILTS
 from relevance.planner.kernels.kinematics import FRAME, arm_at, hand_down, look_at_frames
 from relevance.planner.kernels.motions import reach_to
 from relevance.planner.path import Motion, shoulder_depth

@@ -25,7 +25,7 @@ from structure import (
 DOORS = {
     "pybullet": ("simulation",),
     "casadi": ("planner",),
-    "numba": ("scene", "sampling", "simulation", "planner"),
+    "numba": ("scene", "holding", "networks", "sampling", "simulation", "planner"),
     "pyarrow": ("store",),
     "duckdb": ("store",),
     "webdataset": ("store",),

@@ -108,6 +108,9 @@ class Encoding:
     """(B, N, GEOMETRY) estimated or given geometry, decimetres (glimpse, geometry)."""
     between: Tensor | None = None
     """(B, N, N, E) what lies between every two objects, row from column (the same two)."""
+    places: Tensor | None = None
+    """(B, G, N, OBSTRUCTION) who is in the way at the goals that are asked, where it is reckoned
+    outside (a graph that is traced)."""
     scene: Tensor | None = None
     """(B, ...) what was seen of the scene apart from its objects, for bodies that look at a
     subject, a reference and a query together."""

@@ -61,7 +61,7 @@ BODIES.register(
     BodyKind(
         config=GeometryConfig,
         make=GeometryBody,
-        version="3",
+        version="4",
         advantage="is told the true poses of all objects, and reckons what is in the hand's way",
     ),
 )

@@ -1,7 +1,7 @@
 """Our own body: find each object by its view, look at it closely, then reason about the goal.
 
-Shape suffixes: B scenes, N objects (padded), G goals, P cells of the stride-4 feature map,
-D width, E channels, K looks, H and W height and width in pixels, h and w the same at stride 4.
+Shape suffixes: B scenes, N objects (padded), G goals, P cells of the feature map,
+D width, E channels, K looks, H and W height and width in pixels.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from relevance.configs import config
-from relevance.models.config import PATCH, STRIDE, Encoding, ModelConfig, Sight, divides
+from relevance.models.config import PATCH, Encoding, ModelConfig, Sight, divides
 from relevance.models.layers import Attention, columns, small_cnn, unshuffled
 from relevance.models.reasoning import APART, BETWEEN, Between, Thinker, apart
 from relevance.models.registry import BODIES, BodyKind
@@ -25,6 +25,8 @@ from relevance.models.tracing import sums, tracing, windows
 from relevance.networks import DECIMETRE, GEOMETRY
 from relevance.scene import Camera, camera_up
 
+_CELL = 8
+"""Edge of a cell of the feature map, pixels: there objects are found; windows place them."""
 _FINE = 2 * PATCH
 """Samples along the edge of a window, which has as many pixels: a box is placed by its edges."""
 _GROUND = 0.035
@@ -44,7 +46,7 @@ class GlimpseConfig(ModelConfig):
     layers: Annotated[int, Field(ge=1)] = 2
     """Attention layers over the objects given the goal."""
     channels: Annotated[int, Field(ge=2)] = 32
-    """E, channels of the stride-4 feature map."""
+    """E, channels of the feature map."""
     window: Annotated[int, Field(ge=1)] = 64
     """Edge of the image window around a matched object, pixels; looked at by 64 samples."""
 
@@ -62,7 +64,7 @@ class GlimpseConfig(ModelConfig):
 class GlimpseBody(Thinker):
     """Find each object, look at it closely, then reason about the goal over all objects.
 
-    Match: dot product of the view's embedding with a stride-4 feature map; softmax and
+    Match: dot product of the view's embedding with a map of features; softmax and
     soft-argmax in float32 say where the object is. Glimpse: the image window there,
     resampled to 32x32, goes through a small CNN together with the match map of the same
     window. Geometry (position, size, footprint half-extents) is estimated from both, then
@@ -75,10 +77,10 @@ class GlimpseBody(Thinker):
         super().__init__()
         width, channels = config.width, config.channels
         self.window, self.camera = config.window, config.camera
-        # Space-to-depth first: at stride 4 a 3x3 convolution is cheap and no pixel is lost.
+        # Space-to-depth first: on cells a 3x3 convolution is cheap and no pixel is lost.
         self.scene = nn.Sequential(
-            nn.PixelUnshuffle(STRIDE),
-            nn.Conv2d(3 * STRIDE**2, channels, 1),
+            nn.PixelUnshuffle(_CELL),
+            nn.Conv2d(3 * _CELL**2, channels, 1),
             nn.ReLU(),
             nn.Conv2d(channels, channels, 3, padding=1),
             nn.ReLU(),
@@ -87,7 +89,9 @@ class GlimpseBody(Thinker):
         self.view = small_cnn(3, (channels // 2, channels, channels), width)
         self.view_key = nn.Linear(width, channels)
         self.sharpness = nn.Parameter(torch.tensor(2.5))
-        self.look = small_cnn(3 * 4 + 1, (24, 48, 64), width)
+        # Begins with two convolutions, of the colours and of where the object was found.
+        self.look = small_cnn(1, (24, 48, 64), width)
+        self.colours = nn.Conv2d(3, 24, 8, stride=4, padding=2)
         seen = 2 * width + 4
         self.estimate = nn.Sequential(nn.Linear(seen, width), nn.GELU(), nn.Linear(width, GEOMETRY))
         self.seen = nn.Sequential(nn.Linear(seen + GEOMETRY, width), nn.GELU())
@@ -117,8 +121,9 @@ class GlimpseBody(Thinker):
             match_BNP = key_BNE @ features_BEP * norm_B1P
             where_BNP = match_BNP.softmax(-1)
             centre_BN2 = where_BNP @ self.cells_P2
-        window = self._window(image, where_BNP.detach(), centre_BN2.detach())
-        look_BND = self.look(window).view(batch, objects, -1)
+        colours, heat = self._windows(image, where_BNP.detach(), centre_BN2.detach())
+        found = self.look[0](heat) + self.colours(colours)
+        look_BND = self.look[1:](found).view(batch, objects, -1)
         ground_BN2 = _on_the_ground(centre_BN2, self.camera)
         seen = torch.cat([view_BND, look_BND, centre_BN2, ground_BN2], dim=-1)
         geometry = self.estimate(seen).float()
@@ -131,24 +136,24 @@ class GlimpseBody(Thinker):
         encoding = self.thought(self.token(geometry) + self.carry(x), present, geometry)
         if self.training:
             at = scene_K, place_K = present.nonzero(as_tuple=True)
-            grid = image.shape[-2] // STRIDE, image.shape[-1] // STRIDE
+            grid = image.shape[-2] // _CELL, image.shape[-1] // _CELL
             sight = Sight(
                 scene=scene_K, place=place_K, geometry=geometry[at], match=match_BNP[at], grid=grid
             )
             encoding = replace(encoding, sight=sight)
         return encoding
 
-    def _window(self, image: Tensor, where_BNP: Tensor, centre_BN2: Tensor) -> Tensor:
-        """Windows around the centres, (B*N, 13, 32, 32): colours of four samples, and match map."""
+    def _windows(
+        self, image: Tensor, where_BNP: Tensor, centre_BN2: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Windows around the centres: colours (B*N, 3, 64, 64) and match maps (B*N, 1, 32, 32)."""
         batch, objects = where_BNP.shape[:2]
         height, width = image.shape[-2:]
         if tracing():
-            map_NHW = where_BNP[0].unflatten(-1, (height // STRIDE, width // STRIDE))
-            peak, _ = windows(map_NHW[:, None], centre_BN2[0], self.window / STRIDE, own=True)
+            map_NHW = where_BNP[0].unflatten(-1, (height // _CELL, width // _CELL))
+            peak, _ = windows(map_NHW[:, None], centre_BN2[0], self.window / _CELL, own=True)
             colours, inside = windows(image, centre_BN2[0], self.window, own=False, samples=_FINE)
-            highest = where_BNP[0].amax(-1)[:, None, None, None]
-            fine = F.pixel_unshuffle(colours - inside / 2, 2)
-            return torch.cat([fine, peak / highest], dim=1)
+            return colours - inside / 2, peak / where_BNP[0].amax(-1)[:, None, None, None]
         edge = image.new_tensor([self.window / width, self.window / height])
         fine, coarse = (
             centre_BN2[:, :, None, None] + _square(n, image.device) * edge for n in (_FINE, PATCH)
@@ -157,11 +162,10 @@ class GlimpseBody(Thinker):
             image - 0.5, fine.view(batch, objects * _FINE, _FINE, 2), align_corners=False
         )
         colours = colours.view(batch, 3, objects, _FINE, _FINE).transpose(1, 2)
-        shape = (batch * objects, 1, height // STRIDE, width // STRIDE)
+        shape = (batch * objects, 1, height // _CELL, width // _CELL)
         peak = (where_BNP / where_BNP.amax(-1, keepdim=True)).view(shape)
         heat = F.grid_sample(peak, coarse.view(-1, PATCH, PATCH, 2), align_corners=False)
-        fine = F.pixel_unshuffle(colours.reshape(-1, 3, _FINE, _FINE), 2)
-        return torch.cat([fine, heat], dim=1)
+        return colours.reshape(-1, 3, _FINE, _FINE), heat
 
 
 def _square(count: int, device: torch.device) -> Tensor:
@@ -171,9 +175,9 @@ def _square(count: int, device: torch.device) -> Tensor:
 
 
 def _cell_centres(camera: Camera) -> Tensor:
-    """Centres of the stride-4 cells, (h*w, 2): u right and v down, each in -1..1."""
-    u = (torch.arange(camera.width // STRIDE) + 0.5) * (2 * STRIDE / camera.width) - 1
-    v = (torch.arange(camera.height // STRIDE) + 0.5) * (2 * STRIDE / camera.height) - 1
+    """Centres of the cells, (P, 2): u right and v down, each in -1..1."""
+    u = (torch.arange(camera.width // _CELL) + 0.5) * (2 * _CELL / camera.width) - 1
+    v = (torch.arange(camera.height // _CELL) + 0.5) * (2 * _CELL / camera.height) - 1
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(-1, 2)
 
 
@@ -199,7 +203,7 @@ BODIES.register(
     BodyKind(
         config=GlimpseConfig,
         make=GlimpseBody,
-        version="4",
+        version="5",
         advantage="sees the views of all objects, learned from masks and poses, and reckons what "
         "is in the hand's way where it sees them",
     ),

@@ -15,12 +15,14 @@ import torch
 from torch import Tensor, nn
 
 from relevance.models.config import PATCH, Encoding, ModelConfig
+from relevance.models.reasoning import Thinker
 from relevance.models.registry import RelevanceModel
 from relevance.networks import GEOMETRY, WEIGHTS, label
+from relevance.networks.obstruction import OBSTRUCTION
 from relevance.scene import PREDICATES
 
 _OPSET = 20
-_SEEN = ("tokens", "geometry", "between", "scene")
+_SEEN = ("tokens", "geometry", "scene")
 
 
 class _Encoder(nn.Module):
@@ -43,6 +45,17 @@ class _Encoder(nn.Module):
         return tuple(part for name in _SEEN if (part := getattr(found, name)) is not None)
 
 
+class _Between(nn.Module):
+    """From where objects are and who is in the way of a pick to what lies between them."""
+
+    def __init__(self, body: Thinker) -> None:
+        super().__init__()
+        self.body = body
+
+    def forward(self, geometry: Tensor, picks: Tensor) -> Tensor:
+        return self.body.between_all(geometry, picks)
+
+
 class _Decoder(nn.Module):
     """From the parts of an encoding and goals (G, 2) to scores (G, N)."""
 
@@ -60,13 +73,15 @@ class _Decoder(nn.Module):
             present=present,
             geometry=parts.get("geometry"),
             between=parts.get("between"),
+            places=parts.get("places"),
             scene=parts.get("scene"),
         )
         return self.body.decode(encoding, self.predicate, goals[None], asked).scores[0]
 
 
 def export_graphs(model: RelevanceModel) -> dict[str, bytes]:
-    """The graphs that a `GraphNetwork` runs: `encode` and one for each predicate.
+    """The graphs that a `GraphNetwork` runs: `encode`, `between` of bodies that are told what is in
+    the way, and one for each predicate.
 
     Raises RuntimeError, or what the body raises, where a body cannot be traced.
     """
@@ -89,7 +104,8 @@ def _graphs(config: ModelConfig, predicates: tuple[str, ...]) -> tuple[tuple[str
             "views": torch.zeros(objects, 3, PATCH, PATCH, dtype=torch.uint8),
         }
     varies = {"views": {0: "N"}, "poses": {0: "N"}, "tokens": {1: "N"}, "geometry": {1: "N"}}
-    varies["between"] = {1: "N", 2: "N"}
+    varies |= {"picks": {1: "N", 2: "N"}, "between": {1: "N", 2: "N"}}
+    varies |= {"goals": {0: "G"}, "places": {1: "G", 2: "N"}, "scores": {0: "G", 1: "N"}}
     with torch.no_grad():
         encoder = _Encoder(model)
         found = encoder(*given.values())
@@ -100,11 +116,17 @@ def _graphs(config: ModelConfig, predicates: tuple[str, ...]) -> tuple[tuple[str
         )
         seen = [name for name in _SEEN if getattr(whole, name) is not None]
         graphs = {"encode": _traced(encoder, given, seen, varies)}
-        goals = {"goals": torch.tensor([[0, 1], [1, 2]])}
-        varies |= {"goals": {0: "G"}, "scores": {0: "G", 1: "N"}}
+        parts = dict(zip(seen, found, strict=True))
+        if isinstance(model.body, Thinker):
+            told = {"geometry": parts["geometry"]}
+            told["picks"] = torch.zeros(1, objects, objects, OBSTRUCTION)
+            graphs["between"] = _traced(_Between(model.body), told, ["between"], varies)
+            assert whole.between is not None
+            parts["between"] = whole.between
+            parts["places"] = torch.zeros(1, 2, objects, OBSTRUCTION)
         for name in predicates:
-            inputs = dict(zip(seen, found, strict=True)) | goals
-            graphs[name] = _traced(_Decoder(model, name, seen), inputs, ["scores"], varies)
+            inputs = parts | {"goals": torch.tensor([[0, 1], [1, 2]])}
+            graphs[name] = _traced(_Decoder(model, name, list(parts)), inputs, ["scores"], varies)
     return tuple(graphs.items())
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from relevance.models.config import PATCH, STRIDE, Answer, Sight
+from relevance.models.config import PATCH, Answer, Sight
 from relevance.models.tracing import attend, reshaped, shares, tracing
 from relevance.networks import GEOMETRY
 from relevance.scene import Camera
@@ -119,12 +119,14 @@ def unshuffled(layers: nn.Sequential, image: Tensor) -> Tensor:
     The two are one convolution whose stride is its size, and it shifts the pixels, too: two
     copies of the image less. What follows is faster with the channels last.
     """
-    first, rest = layers[1], layers[2:]
+    cell, first, rest = layers[0], layers[1], layers[2:]
+    assert isinstance(cell, nn.PixelUnshuffle)
     assert isinstance(first, nn.Conv2d)
     assert first.bias is not None
-    weight = first.weight.view(first.out_channels, -1, STRIDE, STRIDE)
+    edge = cell.downscale_factor
+    weight = first.weight.view(first.out_channels, -1, edge, edge)
     shift = first.bias - weight.sum((1, 2, 3)) / 2
-    found = F.conv2d(image, weight, shift, stride=STRIDE)
+    found = F.conv2d(image, weight, shift, stride=edge)
     return rest(found if tracing() else found.contiguous(memory_format=torch.channels_last))
 
 

@@ -7,21 +7,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
 from relevance.models.config import Answer, Encoding
 from relevance.models.layers import Attention, columns, pick
-from relevance.models.obstruction import (
-    OBSTRUCTION,
-    ROBOT,
-    obstructed_goals,
-    obstructed_picks,
-)
+from relevance.models.obstruction import obstructed_goals, obstructed_picks
 from relevance.models.registry import Body
 from relevance.models.tracing import tracing
 from relevance.networks import ANGLES, GEOMETRY
+from relevance.networks.obstruction import OBSTRUCTION, ROBOT
 from relevance.scene import Predicate
 
 GOAL_FEATURES = 3 * GEOMETRY + 2 + 2 * 8
@@ -82,7 +79,9 @@ class Reasoning(nn.Module):
         """Tokens (B, G, N, D) from what is known of a scene and its objects."""
         assert encoding.geometry is not None
         features = goal_features(encoding.geometry, predicate, goals)
-        places = obstructed_goals(encoding.geometry, encoding.present, predicate, goals)
+        places = encoding.places
+        if places is None:
+            places = obstructed_goals(encoding.geometry, encoding.present, predicate, goals)
         features = torch.cat([features, places], dim=3)
         x_BGND = encoding.tokens[:, None] + self.place(features) + self.predicate[predicate.name]
         x = x_BGND[0] if tracing() else x_BGND.flatten(0, 1)
@@ -114,10 +113,16 @@ class Thinker(Body):
     def thought(self, tokens: Tensor, present: Tensor, geometry: Tensor) -> Encoding:
         """What is known of each object, tokens (B, N, D), and where it is, (B, N, GEOMETRY)."""
         tokens = self.among(tokens, columns(present))
-        # The same for all goals of the scene; in the way of the row's pick, then of the column's.
-        picks = obstructed_picks(geometry, present)
-        between = self.reason.between(apart(geometry), picks, picks.transpose(1, 2))
-        return Encoding(tokens=tokens, present=present, geometry=geometry, between=between)
+        encoding = Encoding(tokens=tokens, present=present, geometry=geometry)
+        if tracing():  # a graph of its own, since what is in the way is reckoned outside
+            return encoding
+        between = self.between_all(geometry, obstructed_picks(geometry, present))
+        return replace(encoding, between=between)
+
+    def between_all(self, geometry: Tensor, picks: Tensor) -> Tensor:
+        """(B, N, N, BETWEEN), the same for all goals of the scene; in the way of the row's pick,
+        then of the column's."""
+        return self.reason.between(apart(geometry), picks, picks.transpose(1, 2))
 
     def decode(
         self, encoding: Encoding, predicate: Predicate, goals: Tensor, asked: Tensor

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from relevance.models.config import PATCH
 
 _TILE = 16
-"""Pixels of a row that are copied together."""
+"""Pixels of a row that are copied together, if rows are made of so many."""
 
 
 def tracing() -> bool:
@@ -46,19 +46,20 @@ def windows(
     step_S = ((torch.arange(samples) + 0.5) / samples - 0.5) * edge - 0.5
     middle_N2 = (centre_N2 + 1) * torch.tensor([width / 2, height / 2])
     x_NS, y_NS = (middle_N2[:, axis, None] + step_S for axis in range(2))
+    tile = math.gcd(_TILE, width)
     rows = min(int(edge) + 2, height)
-    tiles = min((rows + 2 * _TILE - 2) // _TILE, width // _TILE)
-    x_N1 = (x_NS[:, :1] / _TILE).floor().clamp(0, width // _TILE - tiles)
+    tiles = min((rows + 2 * tile - 2) // tile, width // tile)
+    x_N1 = (x_NS[:, :1] / tile).floor().clamp(0, width // tile - tiles)
     y_N1 = y_NS[:, :1].floor().clamp(0, height - rows)
-    corner_N1 = (y_N1 * (width // _TILE) + x_N1).long()
+    corner_N1 = (y_N1 * (width // tile) + x_N1).long()
     if own:
         map_N = torch.arange(centre_N2.shape[0])
-        corner_N1 = corner_N1 + map_N[:, None] * (height * width // _TILE)
+        corner_N1 = corner_N1 + map_N[:, None] * (height * width // tile)
     part = torch.arange(channels)[:, None] * height + torch.arange(rows)
-    part = part[..., None] * (width // _TILE) + torch.arange(tiles)
+    part = part[..., None] * (width // tile) + torch.arange(tiles)
     place_NK = corner_N1 + part.flatten()
-    cut = maps_MCHW.reshape(-1, _TILE)[place_NK].view(-1, channels * rows, tiles * _TILE)
-    across_NSR = _taps(x_NS - x_N1 * _TILE, tiles * _TILE)
+    cut = maps_MCHW.reshape(-1, tile)[place_NK].view(-1, channels * rows, tiles * tile)
+    across_NSR = _taps(x_NS - x_N1 * tile, tiles * tile)
     down_NSR = _taps(y_NS - y_N1, rows)
     cut = (cut @ across_NSR.transpose(1, 2)).view(-1, channels, rows, samples)
     inside = down_NSR.sum(-1)[:, None, :, None] * across_NSR.sum(-1)[:, None, None]

@@ -14,6 +14,7 @@ import numpy as np
 import onnxruntime
 
 from relevance.networks.files import Checkpoint, CheckpointError
+from relevance.networks.obstruction import obstructed_goals, obstructed_picks
 from relevance.scene import Camera, Predicate
 
 GRAPHS_VERSION = 1
@@ -69,8 +70,9 @@ class Network(Protocol):
 class GraphNetwork:
     """The network of a checkpoint in ONNX Runtime, on one thread; a `Network`.
 
-    The graph `encode` has inputs `image` and `views`, or `poses`; that of a predicate takes what
-    `encode` gives, by name, and `goals`. A predicate's is loaded when it is first asked.
+    The graph `encode` has inputs `image` and `views`, or `poses`; `between`, if there is one, takes
+    its `geometry` and `picks`; that of a predicate takes what these give, by name, `goals`, and
+    `places` if it is told (`relevance.networks.obstruction`). It is loaded when it is first asked.
     """
 
     def __init__(self, checkpoint: Checkpoint, path: str | Path) -> None:
@@ -88,6 +90,7 @@ class GraphNetwork:
         self._taken: dict[str, list[str]] = {}
         self._encode = self._session("encode")
         self._seen = [output.name for output in self._encode.get_outputs()]
+        self._between = self._session("between") if "between" in checkpoint.graphs else None
         self.told = [one.name for one in self._encode.get_inputs()] == ["poses"]
 
     def look(
@@ -101,14 +104,22 @@ class GraphNetwork:
                 "image": np.ascontiguousarray(image.transpose(2, 0, 1)),
                 "views": np.ascontiguousarray(views.transpose(0, 3, 1, 2)),
             }
-        return dict(zip(self._seen, self._encode.run(None, given), strict=True))
+        seen = dict(zip(self._seen, self._encode.run(None, given), strict=True))
+        if self._between is not None:
+            picks = obstructed_picks(seen["geometry"], _all(seen["geometry"]))
+            told = {"geometry": seen["geometry"], "picks": picks}
+            (seen["between"],) = self._between.run(None, told)
+        return seen
 
     def judge(
         self, seen: Mapping[str, np.ndarray], predicate: Predicate, goals: np.ndarray
     ) -> np.ndarray:
         """As `Network.judge`."""
         session = self._session(predicate.name)
-        given = {name: seen[name] for name in self._taken[predicate.name]}
+        given = {name: seen[name] for name in self._taken[predicate.name] if name in seen}
+        if "places" in self._taken[predicate.name]:
+            where = seen["geometry"]
+            given["places"] = obstructed_goals(where, _all(where), predicate, goals[None])
         (scores,) = session.run(None, given | {"goals": goals})
         return np.asarray(scores)
 
@@ -157,3 +168,8 @@ class GraphNetwork:
             values = np.asarray(self._checkpoint.weights[name], np.float32, order="C")
             self._values[name] = onnxruntime.OrtValue.ortvalue_from_numpy(values)
         return self._values[name]
+
+
+def _all(geometry: np.ndarray) -> np.ndarray:
+    """That all objects are there."""
+    return np.ones(geometry.shape[:2], np.bool_)

@@ -4,7 +4,7 @@ The hand points down over the box. In the plane it is a set of rectangles that s
 (box, finger tips, fingers, both halves of the palm); for the bounds that look at the arm it is
 boxes on its links.
 
-A box has families of grasps (`kernels.holds`): across both edges that fit the hand, with the
+A box has families of grasps (`holding.holds`): across both edges that fit the hand, with the
 finger tips at several depths, with the hand shifted along the box, and with the hand leaning along
 it, the box level.
 """
@@ -20,14 +20,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from relevance.holding import SHALLOW, SPREAD, TILTS, hand_boxes
-from relevance.planner.kernels.boxes import Bodies
-from relevance.planner.kernels.holds import (
+from relevance.holding.hand import SHALLOW, SPREAD, TILTS, hand_boxes
+from relevance.holding.holds import (
     COLUMNS,
     WRIST_ABOVE,
     WRIST_LEFT,
     sound_holds,
 )
+from relevance.planner.kernels.boxes import Bodies
 from relevance.planner.kernels.kinematics import FLANGE
 from relevance.robot import HAND, panda
 from relevance.scene import Box
@@ -72,7 +72,7 @@ class Family:
     axes: np.ndarray
     """(G,)."""
     rows: np.ndarray
-    """(G, COLUMNS): as `kernels.holds` has them."""
+    """(G, COLUMNS): as `holding.holds` has them."""
     parts: np.ndarray
     """(G, P, 5): `Grasp.parts` of each."""
     _made: dict[int, Grasp] = field(default_factory=dict)

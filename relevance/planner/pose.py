@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from relevance.holding.clearances import pick_gaps
+from relevance.holding.hand import MARGIN, PICK_MARGIN
 from relevance.planner.grasps import (
     Family,
     Grasp,
@@ -24,12 +26,9 @@ from relevance.planner.kernels.kinematics import facing, reach_interval
 from relevance.planner.kernels.planar import (
     ANY_TURN,
     FOUND,
-    MARGIN,
     NONE,
-    PICK_MARGIN,
     UNDECIDED,
     find_pose,
-    pick_blockers,
     slack,
     volumes,
 )
@@ -265,20 +264,20 @@ class PoseBound:
         spare = self._spare_reach(problem.boxes[name], family)
         if not (spare >= -CLOSE).any():
             return _Blocked(family, [None] * len(family), frozenset(), (), {})
-        blocking = np.zeros((len(family), count), np.bool_)
+        gaps = np.empty((len(family), count))
         boxes, names, seen = problem.obstacles[:count], list(problem.boxes), {}
 
         def blockers(ease: float) -> tuple[list[frozenset[str] | None], float]:
             room = PICK_MARGIN - ease
-            close = pick_blockers(i, family.axes, family.parts, boxes, room, blocking)
+            pick_gaps(i, family.axes, family.parts, boxes, room, 1.0, gaps)
             who = list[frozenset[str] | None]()
-            rows = blocking.tobytes()
+            rows = (gaps < 0).tobytes()
             for g, within in enumerate((spare >= -ease).tolist()):
                 bits = rows[g * count : (g + 1) * count]
                 if within and bits not in seen:
                     seen[bits] = frozenset(compress(names, bits))
                 who.append(seen[bits] if within else None)
-            return who, close
+            return who, abs(gaps).min()
 
         who, close = blockers(0.0)
         sets = frozenset(one for one in who if one is not None)

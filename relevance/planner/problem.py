@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
-from relevance.holding import REGION_MARGIN
+from relevance.holding.hand import REGION_MARGIN
 from relevance.planner import logic
 from relevance.planner.kernels.kinematics import Arm, arm_at
 from relevance.planner.result import Counts, Seconds

@@ -1,10 +1,7 @@
-"""The hand in the plane: what is in its way, and where a held box is free.
+"""Where a held box is free, in the plane.
 
-A box in the hand is a set of rectangles that share one angle (box, finger tips, fingers, palm),
-each with the height of its underside; it comes straight down, so an obstacle matters to a part
-iff it rises above that underside. Whether a free pose exists in a region is decided by branch
-and bound over (x, y, angle): clearance is Lipschitz, so a cell whose centre overlaps by more than
-its radius holds no free pose.
+Whether a free pose exists in a region is decided by branch and bound over (x, y, angle): clearance
+is Lipschitz, so a cell whose centre overlaps by more than its radius holds no free pose.
 """
 
 from __future__ import annotations
@@ -14,7 +11,8 @@ import math
 import numpy as np
 from numba import njit
 
-from relevance.holding import MARGIN, PICK_MARGIN
+from relevance.holding.clearances import clearance
+from relevance.holding.hand import MARGIN
 from relevance.scene.geometry import UPRIGHT, rectangle_gap, upright
 
 COMFORT = 0.008
@@ -24,38 +22,8 @@ MAX_LEVEL = 6
 TURN, TURN_MARGIN, ANY_TURN = 0.1, 0.02, 4.0
 """What a turn of the last joint counts against a distance, m/rad (less than the hand is long);
 what it keeps from its limit, and a half width that is none, rad."""
-HAND_REACH = 0.2
-"""Farther from a box nothing is in the way of the hand that takes it, m."""
 
 FOUND, NONE, UNDECIDED = 1, 0, 2
-
-
-@njit(cache=True)
-def pick_blockers(i, axes, parts, obstacles, room, blocking):
-    """Fill blocking (G, N) bool: which boxes are in the way of taking box i with each grasp.
-
-    axes (G,), parts (G, P, 5): of the grasps. obstacles (N, UPRIGHT): all the boxes. room: asked
-    for around the hand, m. Returns how close the closest decision was, m.
-    """
-    closest = 1.0
-    o = obstacles[i]
-    bottom, top = o[2] - o[6], o[2] + o[6]
-    for k in range(len(obstacles)):
-        other = obstacles[k : k + 1]
-        dx, dy = o[0] - other[0, 0], o[1] - other[0, 1]
-        apart = math.sqrt(dx * dx + dy * dy) - o[7] - other[0, 7]
-        for g in range(len(axes)):
-            blocking[g, k] = False
-            if k == i or apart > HAND_REACH:
-                continue
-            angle = o[3] + axes[g] * math.pi / 2
-            gap = clearance(o[0], o[1], angle, bottom, parts[g, 1:], other) - room
-            if other[0, 2] - other[0, 6] >= top - 2e-3:  # what overhangs blocks the way up
-                over = clearance(o[0], o[1], angle, top, parts[g, :1], other)
-                gap = min(gap, over + PICK_MARGIN - room)
-            blocking[g, k] = gap < 0
-            closest = min(closest, abs(gap))
-    return closest
 
 
 @njit(cache=True)
@@ -78,30 +46,6 @@ def reaching_into(area, bottom, spread, obstacles):
             gap = rectangle_gap(area[0], area[1], c, s, a, b, o[0], o[1], o[8], o[9], o[4], o[5])
             found[w] = gap <= 0
     return found
-
-
-@njit(cache=True)
-def clearance(x, y, angle, bottom, parts, obstacles):
-    """Smallest separating-axis distance of parts and the obstacles that rise above them, m."""
-    best = 1.0
-    c, s = math.cos(angle), math.sin(angle)
-    for i in range(len(parts)):
-        offset, left = parts[i, 0], parts[i, 1]
-        along, across, under = parts[i, 2], parts[i, 3], parts[i, 4]
-        px, py = x + c * offset - s * left, y + s * offset + c * left
-        radius = math.sqrt(along * along + across * across)
-        for k in range(len(obstacles)):
-            o = obstacles[k]
-            above = o[2] + o[6] - bottom - under
-            if above <= -MARGIN or (under == 0.0 and abs(above) < 1e-6):  # the box's own support
-                continue
-            flat = radius + o[7] + best
-            dx, dy = o[0] - px, o[1] - py
-            if dx * dx + dy * dy > flat * flat:
-                continue
-            gap = rectangle_gap(px, py, c, s, along, across, o[0], o[1], o[8], o[9], o[4], o[5])
-            best = min(best, gap)
-    return best
 
 
 @njit(cache=True)
@@ -134,7 +78,7 @@ def slack(x, y, angle, bottom, parts, obstacles, table, base, reach, enough):
     shared = min(shared, table[1] - abs(y) - s * along - c * across)
     if shared < -0.2:
         return shared, 0
-    shared = min(shared, clearance(x, y, angle, bottom, parts[0, :1], obstacles) - MARGIN)
+    shared = min(shared, clearance(x, y, angle, bottom, parts[0, :1], obstacles, 1.0) - MARGIN)
     if shared < -enough:
         return shared, 0
     best, which = -1.0, 0
@@ -148,7 +92,7 @@ def slack(x, y, angle, bottom, parts, obstacles, table, base, reach, enough):
             off -= 2 * math.pi * math.floor(off / (2 * math.pi) + 0.5)
             worst = min(worst, TURN * (reach[v, 4] - TURN_MARGIN - abs(off)))
         if worst > best:
-            hand = clearance(x, y, angle, bottom, parts[v, 1:], obstacles) - MARGIN
+            hand = clearance(x, y, angle, bottom, parts[v, 1:], obstacles, 1.0) - MARGIN
             worst = min(worst, hand)
             if worst > best:
                 best, which = worst, v

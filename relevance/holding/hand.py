@@ -1,4 +1,4 @@
-"""How the hand takes boxes and what room it asks for: what planner and networks both go by."""
+"""How the hand takes boxes and what room it asks for, in numbers."""
 
 from __future__ import annotations
 
@@ -46,7 +46,9 @@ class HandBoxes(NamedTuple):
     """(T, P, 5): for each of TILTS, fingers shut, over the middle of its tips: offset along the
     finger axis and to its left, half extents along and across it, height of the underside; m."""
     tip: float
+    """Length of the hand, m."""
     max_opening: float
+    """The widest, m."""
 
 
 @cache

@@ -11,7 +11,7 @@ import math
 
 from numba import njit
 
-from relevance.holding import (
+from relevance.holding.hand import (
     DEPTH,
     FARTHEST,
     GRIP,
@@ -38,11 +38,10 @@ def sound_holds(size, ways, hand, over, tip, opening, flange, axes, rows, parts)
     returns how many.
 
     size (3,). ways (W, 3): index in TILTS, share of the farthest shift, 0 for the deepest or
-    index + 1 in SHALLOW. hand (P, 3): half extent across the finger axis, distance over the tips,
-    and which way opening moves it, of finger tips, fingers and both halves of the palm; over
-    (T, P, 5): the hand for each of TILTS, fingers shut, over the middle of its tips, as
-    `Grasp.parts` has it. tip, flange: lengths of hand and flange, m. opening: the widest, m. Fills
-    axes (2 W,), rows (2 W, COLUMNS), parts (2 W, 1 + P, 5).
+    index + 1 in SHALLOW (negative: or the deepest, where the box is too low for that). hand (P, 3),
+    over (T, P, 5), tip, opening: as `HandBoxes` has them, of finger tips, fingers and both halves
+    of the palm. flange: its length, m. Fills axes (2 W,), rows (2 W, COLUMNS),
+    parts (2 W, 1 + P, 5).
     """
     count, palm, height = 0, len(hand) - 2, size[2]
     deep = min(DEPTH, max(height - 0.012, 0.3 * height, min(0.010, height - GROUND)))
@@ -59,8 +58,12 @@ def sound_holds(size, ways, hand, over, tip, opening, flange, axes, rows, parts)
             shift, tilt = ways[w, 1] * max(most, 0.0), TILTS[which]
             s, c = math.sin(tilt), math.cos(tilt)
             lowest = min(deep, height - GROUND - hand[0, 0] * abs(s))  # of the tips' lower corner
-            depth = lowest if level == 0 else SHALLOW[level - 1]
-            if depth < GRIP or (level > 0 and depth >= lowest - 0.002):
+            depth = lowest if level == 0 else SHALLOW[abs(level) - 1]
+            if depth >= lowest - 0.002:
+                if level > 0:
+                    continue
+                depth = lowest
+            if depth < GRIP:
                 continue
             # Where, on the side that the hand leans to, the box's top is nearest to the palm.
             end = edge - (shift if tilt > 0 else -shift)
