@@ -21,7 +21,7 @@ def known():
     return {
         f"{kernel.py_func.__module__}.{kernel.py_func.__name__}": len(kernel.overloads)
         for name, module in list(sys.modules.items())
-        if name.startswith(("relevance.planner", "relevance.scene"))
+        if name.startswith(("relevance.planner", "relevance.holding", "relevance.scene"))
         for kernel in vars(module).values() if isinstance(kernel, Dispatcher)
     }
 

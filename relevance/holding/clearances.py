@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
 from relevance.holding.hand import MARGIN, PICK_MARGIN
@@ -29,14 +30,19 @@ def pick_gaps(i, axes, parts, obstacles, room, most, gaps):
     """
     o = obstacles[i]
     bottom, top = o[2] - o[6], o[2] + o[6]
+    gaps[:] = most
+    lowest = np.inf
+    for g in range(len(axes)):
+        for p in range(1, parts.shape[1]):
+            lowest = min(lowest, parts[g, p, 4])
     for k in range(len(obstacles)):
         other = obstacles[k : k + 1]
         dx, dy = o[0] - other[0, 0], o[1] - other[0, 1]
         apart = math.sqrt(dx * dx + dy * dy) - o[7] - other[0, 7]
+        under = other[0, 2] + other[0, 6] - bottom - lowest <= -MARGIN
+        if k == i or apart > HAND_REACH or under:
+            continue
         for g in range(len(axes)):
-            gaps[g, k] = most
-            if k == i or apart > HAND_REACH:
-                continue
             angle = o[3] + axes[g] * math.pi / 2
             gap = clearance(o[0], o[1], angle, bottom, parts[g, 1:], other, most) - room
             if other[0, 2] - other[0, 6] >= top - OVERHANG:  # it blocks the way up

@@ -15,7 +15,8 @@ import onnxruntime
 
 from relevance.networks.files import Checkpoint, CheckpointError
 from relevance.networks.obstruction import obstructed_goals, obstructed_picks
-from relevance.scene import Camera, Predicate
+from relevance.networks.poses import GEOMETRY
+from relevance.scene import PREDICATES, Camera, Predicate
 
 GRAPHS_VERSION = 1
 """Raised when what goes into graphs and comes out of them changes."""
@@ -91,6 +92,11 @@ class GraphNetwork:
         self._encode = self._session("encode")
         self._seen = [output.name for output in self._encode.get_outputs()]
         self._between = self._session("between") if "between" in checkpoint.graphs else None
+        if self._between is not None:  # its kernels are compiled or loaded before a look's clock
+            nothing = np.ones((1, 2, GEOMETRY), np.float32)
+            obstructed_picks(nothing, _all(nothing))
+            goals = np.array([[[0, 1]]])
+            obstructed_goals(nothing, _all(nothing), PREDICATES["on"], goals)
         self.told = [one.name for one in self._encode.get_inputs()] == ["poses"]
 
     def look(
