@@ -27,8 +27,14 @@ from relevance.scene import Camera, camera_up
 
 _CELL = 8
 """Edge of a cell of the feature map, pixels: there objects are found; windows place them."""
+_AROUND = 28
+"""How far from its likeliest place an object is looked for, in pixels either way."""
+_NOBODY = -1e4
+"""What contends for no cell."""
 _FINE = 2 * PATCH
 """Samples along the edge of a window, which has as many pixels: a box is placed by its edges."""
+_OFF = 0.1
+"""What a box's middle may well be off from where it is seen, in u and v."""
 _GROUND = 0.035
 """Height at which a sight line is cut for a first guess of the position, m: half a box."""
 
@@ -106,6 +112,9 @@ class GlimpseBody(Thinker):
         self.thinks(width, config.heads, config.layers, predicates)
         self.cells_P2: Tensor
         self.register_buffer("cells_P2", _cell_centres(config.camera), persistent=False)
+        self.around_2: Tensor
+        around = torch.tensor([1 / config.camera.width, 1 / config.camera.height]) * _AROUND * 2
+        self.register_buffer("around_2", around, persistent=False)
 
     def encode(self, image: Tensor, views: Tensor, present: Tensor) -> Encoding:
         """As `RelevanceModel.encode`, inputs float in 0..1."""
@@ -119,20 +128,23 @@ class GlimpseBody(Thinker):
             norm_B1P = sums(features_BEP.square()).clamp(min=1e-6).rsqrt()
             key_BNE = F.normalize(key_BNE.float(), dim=-1) * self.sharpness.exp()
             match_BNP = key_BNE @ features_BEP * norm_B1P
-            where_BNP = match_BNP.softmax(-1)
-            centre_BN2 = where_BNP @ self.cells_P2
+            # A cell shows one object: those that are alike contend for it.
+            own = match_BNP.masked_fill(~present[..., None], _NOBODY).log_softmax(1)
+            match_BNP = match_BNP + own
+            where_BNP = match_BNP.softmax(2)
+            centre_BN2 = self._centre(where_BNP, image.shape[-2] // _CELL)
         colours, heat = self._windows(image, where_BNP.detach(), centre_BN2.detach())
         found = self.look[0](heat) + self.colours(colours)
         look_BND = self.look[1:](found).view(batch, objects, -1)
-        ground_BN2 = _on_the_ground(centre_BN2, self.camera)
+        ground_BN2 = _cut(centre_BN2, _GROUND, self.camera)[..., :2]
         seen = torch.cat([view_BND, look_BND, centre_BN2, ground_BN2], dim=-1)
-        geometry = self.estimate(seen).float()
-        geometry = torch.cat([geometry[..., :2] + ground_BN2, geometry[..., 2:]], dim=-1)
+        apparent = self.estimate(seen).float()
+        geometry = _placed(centre_BN2, apparent, self.camera)
         x = self.seen(torch.cat([seen, geometry], dim=-1))
         allowed, between = columns(present), self.between(apart(geometry))
         for layer in self.settle:
             x = layer(x, allowed, between)
-        geometry = geometry + self.correct(x).float()
+        geometry = _placed(centre_BN2, apparent + self.correct(x).float(), self.camera)
         encoding = self.thought(self.token(geometry) + self.carry(x), present, geometry)
         if self.training:
             at = scene_K, place_K = present.nonzero(as_tuple=True)
@@ -142,6 +154,17 @@ class GlimpseBody(Thinker):
             )
             encoding = replace(encoding, sight=sight)
         return encoding
+
+    def _centre(self, where_BNP: Tensor, rows: int) -> Tensor:
+        """Where objects are seen, (B, N, 2): the mean over what lies around the likeliest place,
+        so that what looks alike elsewhere does not count."""
+        maps = where_BNP.detach().flatten(0, 1).unflatten(1, (1, rows, -1))
+        peak_BN = F.avg_pool2d(maps, 3, stride=1, padding=1).flatten(1).argmax(1)
+        peak_BN2 = self.cells_P2[peak_BN].view(*where_BNP.shape[:2], 1, 2)
+        off = (self.cells_P2 - peak_BN2).abs()
+        near = (off <= self.around_2).all(-1)
+        around = where_BNP * near
+        return around @ self.cells_P2 / around.sum(2, keepdim=True).clamp(min=1e-6)
 
     def _windows(
         self, image: Tensor, where_BNP: Tensor, centre_BN2: Tensor
@@ -181,8 +204,20 @@ def _cell_centres(camera: Camera) -> Tensor:
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(-1, 2)
 
 
-def _on_the_ground(centre: Tensor, camera: Camera) -> Tensor:
-    """Where the sight lines through (u, v) cut the plane z = _GROUND: x, y in decimetres."""
+def _placed(centre: Tensor, apparent: Tensor, camera: Camera) -> Tensor:
+    """Geometry (..., GEOMETRY) of boxes that appear so at (u, v): how far their middles are from
+    there, their height, and what sizes they would have at a distance of a metre.
+
+    So a box that turns out to stand higher comes nearer along its sight line, and smaller.
+    """
+    z = apparent[..., 2:3] + _GROUND / DECIMETRE
+    place = _cut(centre + _OFF * apparent[..., :2], z * DECIMETRE, camera)
+    return torch.cat([place[..., :2], z, apparent[..., 3:] * place[..., 2:]], dim=-1)
+
+
+def _cut(centre: Tensor, height: Tensor | float, camera: Camera) -> Tensor:
+    """Where the sight lines through (u, v) are at a height (m): x, y in decimetres, and how far
+    from the camera along its axis, m."""
     eye, target, above = (
         centre.new_tensor(vector) for vector in (camera.eye, camera.target, camera_up(camera))
     )
@@ -194,8 +229,8 @@ def _on_the_ground(centre: Tensor, camera: Camera) -> Tensor:
     v = centre[..., 1:] * (tangent * camera.height / camera.width)
     ray = forward + u * right - v * up
     # Sight lines at or above the horizon hit nothing; they are cut far away instead.
-    along = (_GROUND - camera.eye[2]) / ray[..., 2:].clamp(max=-0.1)
-    return (eye[:2] + along * ray[..., :2]) / DECIMETRE
+    along = (height - camera.eye[2]) / ray[..., 2:].clamp(max=-0.1)
+    return torch.cat([(eye[:2] + along * ray[..., :2]) / DECIMETRE, along], dim=-1)
 
 
 BODIES.register(
