@@ -70,13 +70,13 @@ class GlimpseConfig(ModelConfig):
 class GlimpseBody(Thinker):
     """Find each object, look at it closely, then reason about the goal over all objects.
 
-    Match: dot product of the view's embedding with a map of features; softmax and
-    soft-argmax in float32 say where the object is. Glimpse: the image window there,
-    resampled to 32x32, goes through a small CNN together with the match map of the same
-    window. Geometry (position, size, footprint half-extents) is estimated from both, then
-    settled with what lies between the objects known: what a box stands on tells whether it is a
-    small one near by or a large one behind. From there on it is the body `geometry`, told what
-    was estimated and what was seen besides.
+    Match: dot product of the view's embedding with a map of features, for whose cells the objects
+    contend; softmax in float32 and the mean around its peak say where the object is. Glimpse: the
+    image window there goes through a small CNN together with the match map of the same window.
+    Both say how the box appears (how far its middle is from there, its height, its apparent sizes),
+    which the camera makes geometry of; that is settled with what lies between the objects known:
+    what a box stands on tells whether it is a small one near by or a large one behind. From there
+    on it is the body `geometry`, told what was estimated and what was seen besides.
     """
 
     def __init__(self, config: GlimpseConfig, predicates: Sequence[str]) -> None:
@@ -96,8 +96,8 @@ class GlimpseBody(Thinker):
         self.view_key = nn.Linear(width, channels)
         self.sharpness = nn.Parameter(torch.tensor(2.5))
         # Begins with two convolutions, of the colours and of where the object was found.
-        self.look = small_cnn(1, (24, 48, 64), width)
-        self.colours = nn.Conv2d(3, 24, 8, stride=4, padding=2)
+        self.look = small_cnn(1, (32, 64, 64), width)
+        self.colours = nn.Conv2d(3, 32, 8, stride=4, padding=2)
         seen = 2 * width + 4
         self.estimate = nn.Sequential(nn.Linear(seen, width), nn.GELU(), nn.Linear(width, GEOMETRY))
         self.seen = nn.Sequential(nn.Linear(seen + GEOMETRY, width), nn.GELU())
