@@ -20,7 +20,6 @@ from relevance.models import (
     BODIES,
     DECIMETRE,
     GEOMETRY,
-    STRIDE,
     Answer,
     Body,
     BodyKind,
@@ -35,6 +34,7 @@ from relevance.models import (
     reasoning,
 )
 from relevance.models.geometry import GeometryConfig
+from relevance.models.glimpse import _CELL as CELL
 from relevance.models.glimpse import GlimpseBody, GlimpseConfig
 from relevance.models.resnet import ResnetConfig
 from relevance.models.resnet3d import Resnet3dConfig
@@ -239,43 +239,82 @@ def test_half_extents_are_those_of_the_corners(x: float, y: float, yaw: float) -
     np.testing.assert_allclose(found.numpy(), (box.corners() @ axes).max(0), atol=1e-9)
 
 
+def uv(camera: Camera, point: np.ndarray) -> torch.Tensor:
+    """Where the camera sees a point, u and v in -1..1."""
+    pixel, _ = project(camera, point)
+    return torch.tensor(pixel / np.array([camera.width, camera.height]) * 2 - 1).float()
+
+
 @settings(deadline=None)
-@given(x=st.floats(-0.15, 0.25), y=st.floats(-0.3, 0.3))
-def test_sight_lines_invert_the_projection(x: float, y: float) -> None:
+@given(x=st.floats(-0.15, 0.25), y=st.floats(-0.3, 0.3), z=st.floats(0.0, 0.2))
+def test_sight_lines_invert_the_projection(x: float, y: float, z: float) -> None:
     camera = Camera()
-    pixel, _ = project(camera, np.array([x, y, glimpse._GROUND]))
-    uv = pixel / np.array([camera.width, camera.height]) * 2 - 1
-    found = glimpse._on_the_ground(torch.tensor(uv, dtype=torch.float32), camera)
-    np.testing.assert_allclose(found.numpy() * DECIMETRE, [x, y], atol=1e-4)
+    _, depth = project(camera, np.array([x, y, z]))
+    found = glimpse._cut(uv(camera, np.array([x, y, z])), z, camera)
+    np.testing.assert_allclose(found[:2].numpy() * DECIMETRE, [x, y], atol=1e-4)
+    assert float(found[2]) == pytest.approx(float(depth), abs=1e-4)
 
 
 def test_sight_lines_of_a_camera_that_looks_straight_down() -> None:
     camera = Camera(eye=(0.1, 0.0, 0.9), target=(0.1, 0.0, 0.0))
-    pixel, _ = project(camera, np.array([0.15, -0.1, glimpse._GROUND]))
-    uv = pixel / np.array([camera.width, camera.height]) * 2 - 1
-    found = glimpse._on_the_ground(torch.tensor(uv, dtype=torch.float32), camera)
-    np.testing.assert_allclose(found.numpy() * DECIMETRE, [0.15, -0.1], atol=1e-4)
+    found = glimpse._cut(uv(camera, np.array([0.15, -0.1, 0.05])), 0.05, camera)
+    np.testing.assert_allclose(found[:2].numpy() * DECIMETRE, [0.15, -0.1], atol=1e-4)
 
 
-def test_soft_argmax_and_window_point_at_the_same_pixels() -> None:
-    """A bright square in the image must be in the middle of the window around its centre."""
+def test_a_box_that_stands_higher_is_nearer_and_smaller() -> None:
+    """All of these are seen at the same place, with the same outline."""
+    camera, centre = Camera(), torch.tensor([0.1, -0.2]).expand(3, 2)
+    apparent = torch.ones(3, GEOMETRY)
+    apparent[:, :2], apparent[:, 2] = 0, torch.tensor([0.0, 0.5, 1.0])
+    placed = glimpse._placed(centre, apparent, camera)
+    for row in placed:
+        seen = uv(camera, row[:3].numpy() * DECIMETRE)
+        torch.testing.assert_close(seen, centre[0], atol=1e-5, rtol=0)
+    eye = torch.tensor(camera.eye) / DECIMETRE
+    away = (placed[:, :3] - eye).norm(dim=1)
+    torch.testing.assert_close(placed[:, 3] / placed[0, 3], away / away[0])
+    assert (placed[1:, 3:] < placed[:-1, 3:]).all()
+
+
+def test_objects_contend_for_cells_and_padding_does_not() -> None:
+    body = model("glimpse").body
+    assert isinstance(body, GlimpseBody)
+    seen = []
+    centre = body._centre
+    body._centre = lambda where, rows: seen.append(where) or centre(where, rows)
+    image, views = (x.float() / 255 if x.dtype == torch.uint8 else x for x in pictures())
+    present = torch.ones(views.shape[:2], dtype=torch.bool)
+    with torch.no_grad():
+        body.encode(image, views, present)
+        body.encode(image, views[:, :1], present[:, :1])
+        present[:, 1:] = False
+        body.encode(image, views, present)
+    together, alone, padded = (where[:, 0] for where in seen)
+    assert (together - alone).abs().max() > 1e-6
+    torch.testing.assert_close(padded, alone)
+
+
+def test_soft_argmax_and_windows_point_at_the_same_pixels() -> None:
+    """A bright square in the image must be in the middle of the windows around its centre, and
+    what looks alike elsewhere does not move it."""
     body = model("glimpse").body
     assert isinstance(body, GlimpseBody)
     image = torch.full((1, 3, 192, 320), 0.5)
-    image[..., 80:92, 200:212] = 1.0  # centre at (206, 86)
-    where = torch.zeros(1, 1, 48 * 80)
-    cells = torch.zeros(48, 80)
-    cells[80 // STRIDE : 92 // STRIDE, 200 // STRIDE : 212 // STRIDE] = 1
-    where[0, 0] = cells.flatten() / cells.sum()
-    centre = where @ body.cells_P2
-    expected = torch.tensor([206 / 320, 86 / 192]) * 2 - 1
+    image[..., 80:96, 200:216] = 1.0  # centre at (208, 88)
+    cells = torch.zeros(24, 40)
+    cells[80 // CELL : 96 // CELL, 200 // CELL : 216 // CELL] = 1
+    cells[2, 3] = 1
+    where = (cells.flatten() / cells.sum())[None, None]
+    centre = body._centre(where, 24)
+    expected = torch.tensor([208 / 320, 88 / 192]) * 2 - 1
     torch.testing.assert_close(centre[0, 0], expected, atol=1e-6, rtol=0)
-    window = body._window(image, where, centre)[0]
-    for channel in (window[0], window[12]):
-        weight = channel / channel.sum()
-        middle = (weight.sum(0) * torch.arange(32)).sum(), (weight.sum(1) * torch.arange(32)).sum()
-        assert [float(m) for m in middle] == pytest.approx([15.5, 15.5], abs=0.1)
-        assert channel[15, 15] > 0.45
+    colours, heat = body._windows(image, where, centre)
+    for channel in (colours[0, 0], heat[0, 0]):
+        weight, last = channel / channel.sum(), len(channel) - 1
+        steps = torch.arange(last + 1)
+        middle = (weight.sum(0) * steps).sum(), (weight.sum(1) * steps).sum()
+        assert [float(m) for m in middle] == pytest.approx([last / 2] * 2, abs=0.1)
+        assert channel[last // 2, last // 2] > 0.45
         assert channel[2, 2] == 0
 
 
