@@ -154,8 +154,17 @@ class TrainConfig:
 
     @classmethod
     def laptop(cls) -> Self:
-        """About an hour of one core."""
-        return cls(preset="laptop", steps=15_000, learning_rate=1.5e-3, told_share=0.1)
+        """About an hour of one core.
+
+        Few goals of many scenes: what is seen is learned more slowly than what follows from it.
+        """
+        return cls(
+            preset="laptop",
+            steps=15_000,
+            goals_per_scene=3,
+            learning_rate=1.5e-3,
+            told_share=0.1,
+        )
 
     @classmethod
     def paper(cls) -> Self:
