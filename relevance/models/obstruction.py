@@ -7,6 +7,7 @@ Shape suffixes: B scenes, N objects (padded), G goals.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,5 +34,5 @@ def obstructed_goals(
     return torch.from_numpy(found).to(geometry.device)
 
 
-def _numbers(geometry: Tensor, present: Tensor):
+def _numbers(geometry: Tensor, present: Tensor) -> tuple[np.ndarray, np.ndarray]:
     return geometry.detach().float().cpu().numpy(), present.cpu().numpy()

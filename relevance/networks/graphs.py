@@ -112,8 +112,8 @@ class GraphNetwork:
             }
         seen = dict(zip(self._seen, self._encode.run(None, given), strict=True))
         if self._between is not None:
-            picks = obstructed_picks(seen["geometry"], _all(seen["geometry"]))
-            told = {"geometry": seen["geometry"], "picks": picks}
+            where = np.asarray(seen["geometry"])
+            told = {"geometry": where, "picks": obstructed_picks(where, _all(where))}
             (seen["between"],) = self._between.run(None, told)
         return seen
 
