@@ -44,7 +44,7 @@ def pick_gaps(i, axes, parts, obstacles, room, most, gaps):
             continue
         for g in range(len(axes)):
             angle = o[3] + axes[g] * math.pi / 2
-            gap = clearance(o[0], o[1], angle, bottom, parts[g, 1:], other, most) - room
+            gap = clearance(o[0], o[1], angle, bottom, parts[g, 1:], other, most + room) - room
             if other[0, 2] - other[0, 6] >= top - OVERHANG:  # it blocks the way up
                 over = clearance(o[0], o[1], angle, top, parts[g, :1], other, most)
                 gap = min(gap, over + PICK_MARGIN - room)

@@ -95,7 +95,7 @@ def _picks(geometry, present, ways, hand, found):
         for i in range(len(there)):
             axes, parts = hold(boxes[i], ways, hand)
             gaps = np.empty((len(axes), len(there)))
-            pick_gaps(i, axes, parts, boxes, PICK_MARGIN, FAR + PICK_MARGIN, gaps)
+            pick_gaps(i, axes, parts, boxes, PICK_MARGIN, FAR, gaps)
             obstruction(gaps, there, found[b, there[i]])
 
 
@@ -187,13 +187,11 @@ def place_gaps(boxes, subject, reference, stacked, toward, held):
     gaps = np.full((_TRIED * choices, count), FAR)
     for n in range(_TRIED * choices):
         (x, y, yaw), h = places[n // choices], n % choices
-        c, s = math.cos(yaw), math.sin(yaw)
+        angle = yaw + axes[h] * math.pi / 2
         for k in range(count):
             if others[k]:
-                alone = _flat_gap(x, y, c, s, o[4], o[5], boxes[k])
-                angle = yaw + axes[h] * math.pi / 2
-                hand = clearance(x, y, angle, base, parts[h, 1:], boxes[k : k + 1], FAR + MARGIN)
-                gaps[n, k] = min(min(alone, hand) - MARGIN, FAR)
+                gap = clearance(x, y, angle, base, parts[h], boxes[k : k + 1], FAR + MARGIN)
+                gaps[n, k] = gap - MARGIN
     return gaps
 
 
