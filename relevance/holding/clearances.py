@@ -26,9 +26,10 @@ def pick_gaps(i, axes, parts, obstacles, room, most, gaps):
     """Fill gaps (G, N), m: from taking box i with each grasp to each box, less `room` around the
     hand, `most` at most; negative where that is in the way.
 
-    axes (G,), parts (G, P, 5): of the grasps. obstacles (N, UPRIGHT): all the boxes.
+    axes (G,), parts (G, P, 5): of the grasps. obstacles (N, UPRIGHT): all the boxes. Returns how
+    close the closest decision was, m.
     """
-    o = obstacles[i]
+    o, closest = obstacles[i], most
     bottom, top = o[2] - o[6], o[2] + o[6]
     gaps[:] = most
     lowest = np.inf
@@ -49,6 +50,8 @@ def pick_gaps(i, axes, parts, obstacles, room, most, gaps):
                 over = clearance(o[0], o[1], angle, top, parts[g, :1], other, most)
                 gap = min(gap, over + PICK_MARGIN - room)
             gaps[g, k] = gap
+            closest = min(closest, abs(gap))
+    return closest
 
 
 @njit(cache=True)

@@ -269,7 +269,7 @@ class PoseBound:
 
         def blockers(ease: float) -> tuple[list[frozenset[str] | None], float]:
             room = PICK_MARGIN - ease
-            pick_gaps(i, family.axes, family.parts, boxes, room, 1.0, gaps)
+            close = pick_gaps(i, family.axes, family.parts, boxes, room, 1.0, gaps)
             who = list[frozenset[str] | None]()
             rows = (gaps < 0).tobytes()
             for g, within in enumerate((spare >= -ease).tolist()):
@@ -277,7 +277,7 @@ class PoseBound:
                 if within and bits not in seen:
                     seen[bits] = frozenset(compress(names, bits))
                 who.append(seen[bits] if within else None)
-            return who, abs(gaps).min()
+            return who, close
 
         who, close = blockers(0.0)
         sets = frozenset(one for one in who if one is not None)
