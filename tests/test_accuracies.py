@@ -373,10 +373,11 @@ def test_targets_are_shares_where_sets_tie_and_labels_elsewhere(tmp_path) -> Non
         for yes in (True, False)
         for catalogue in [Catalogue.of(dataset, "train", replace(TRAINING, soft_labels=yes))]
     ]
-    changed = {s.relevant for s, h in zip(*shares, strict=True) if s.relevant != h.relevant}
+    pairs = [(s, h) for s, h in zip(*shares, strict=True) if s != h]
+    assert all(s[:3] == h[:3] for s, h in pairs)
+    changed = {one for s, h in pairs for one, of in zip(s[3], h[3], strict=True) if one != of}
     assert changed == {0.5}
-    assert all(s[:3] == h[:3] for s, h in zip(*shares, strict=True))
-    assert {answer.relevant for answer in shares[1]} == {0.0, 1.0}
+    assert {one for answer in shares[1] for one in answer.relevant} == {0.0, 1.0}
 
 
 def test_soft_labels_are_learned_and_the_loss_stays_a_number(tmp_path) -> None:

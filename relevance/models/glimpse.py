@@ -97,7 +97,8 @@ class GlimpseBody(Thinker):
         self.sharpness = nn.Parameter(torch.tensor(2.5))
         # Begins with two convolutions, of the colours and of where the object was found.
         self.look = small_cnn(1, (32, 64, 64), width)
-        self.colours = nn.Conv2d(3, 32, 8, stride=4, padding=2)
+        colours = nn.Conv2d(3, 32, 8, stride=4, padding=2)
+        self.colours = colours.to(memory_format=torch.channels_last)
         seen = 2 * width + 4
         self.estimate = nn.Sequential(nn.Linear(seen, width), nn.GELU(), nn.Linear(width, GEOMETRY))
         self.seen = nn.Sequential(nn.Linear(seen + GEOMETRY, width), nn.GELU())

@@ -7,7 +7,16 @@ from relevance.store.compacting import altered, compact
 from relevance.store.dataset import Dataset
 from relevance.store.exporting import export
 from relevance.store.files import SPLITS, Files, Source, differences
-from relevance.store.images import MEMBERS, VIEW_SIZE, Pictures, Sample, decode, undecoded
+from relevance.store.images import (
+    MEMBERS,
+    VIEW_SIZE,
+    Pictures,
+    Sample,
+    decode,
+    decoded,
+    scene_text,
+    undecoded,
+)
 from relevance.store.labellings import Labelling
 from relevance.store.needs import needs
 from relevance.store.parquet import empty_size
@@ -56,6 +65,7 @@ __all__ = [
     "copy_file",
     "create_object",
     "decode",
+    "decoded",
     "differences",
     "empty_size",
     "export",
@@ -66,6 +76,7 @@ __all__ = [
     "polled",
     "replacing",
     "replanned",
+    "scene_text",
     "shuffled",
     "sql",
     "sweep",

@@ -119,27 +119,40 @@ def undecoded(content: bytes, url: str) -> Iterator[dict[str, Any]]:
 
 def decode(item: Mapping[str, Any]) -> Sample:
     """A sample from its members, as webdataset groups them; DatasetError names a bad one."""
+    text, where = scene_text(item)
+    scene = scene_from_json(text, where=where)
+    image, views, mask = decoded(item, len(scene.objects))
+    return Sample(key=item["__key__"], scene=scene, image=image, views=views, mask=mask)
+
+
+def scene_text(item: Mapping[str, Any]) -> tuple[bytes, str]:
+    """The scene of a sample as it is stored, and where that is."""
+    return _member(item, "scene.json"), f"{item['__url__']}: {item['__key__']}.scene.json"
+
+
+def decoded(item: Mapping[str, Any], objects: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Image, views and mask of a sample of so many objects, as in `Sample`."""
     where = f"{item['__url__']}: {item['__key__']}"
-    for member in MEMBERS:
-        if member not in item:
-            raise DatasetError(f"{where}: expected member {member}, found none")
 
     def image(member: str, flag: int) -> np.ndarray:
-        content = cv2.imdecode(np.frombuffer(item[member], np.uint8), flag)
+        content = cv2.imdecode(np.frombuffer(_member(item, member), np.uint8), flag)
         if content is None:
             raise DatasetError(f"{where}.{member}: expected an image, found undecodable bytes")
         return content
 
-    scene = scene_from_json(item["scene.json"], where=f"{where}.scene.json")
     wide_HV3 = cv2.cvtColor(image("views.webp", cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-    expected = (VIEW_SIZE, VIEW_SIZE * len(scene.objects), 3)
+    expected = (VIEW_SIZE, VIEW_SIZE * objects, 3)
     if wide_HV3.shape != expected:
         raise DatasetError(f"{where}.views.webp: expected shape {expected}, found {wide_HV3.shape}")
-    views_NHW3 = np.stack(np.split(wide_HV3, len(scene.objects), axis=1))
-    return Sample(
-        key=item["__key__"],
-        scene=scene,
-        image=cv2.cvtColor(image("scene.webp", cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB),
-        views=views_NHW3,
-        mask=image("mask.png", cv2.IMREAD_GRAYSCALE),
+    return (
+        cv2.cvtColor(image("scene.webp", cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB),
+        np.stack(np.split(wide_HV3, objects, axis=1)),
+        image("mask.png", cv2.IMREAD_GRAYSCALE),
     )
+
+
+def _member(item: Mapping[str, Any], member: str) -> bytes:
+    if member not in item:
+        where = f"{item['__url__']}: {item['__key__']}"
+        raise DatasetError(f"{where}: expected member {member}, found none")
+    return item[member]

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from itertools import compress, groupby
+from operator import itemgetter
+from typing import Self
 
 from relevance.scene import PREDICATES, Predicate
 from relevance.store import Dataset, DatasetError, Files, locate
@@ -145,8 +147,9 @@ class Catalogue:
         dataset = Dataset.open(self.root)  # anew: connections to object stores survive no fork
         found: dict[str, dict[Predicate, list[Answer]]] = {}
         for predicate in predicates:
-            for scene, answer in self._answers(dataset, shard, predicate):
-                found.setdefault(scene, {}).setdefault(predicate, []).append(answer)
+            for scene, rows in groupby(self._answers(dataset, shard, predicate), itemgetter(0)):
+                answers = found.setdefault(scene, {}).setdefault(predicate, [])
+                answers.extend(answer for _, answer in rows)
         for members in dataset.undecoded(self.split, shard.number) if found else ():
             if answers := found.pop(members["__key__"], None):
                 yield Example(members=members, family=shard.family, answers=answers)
@@ -169,20 +172,26 @@ class Catalogue:
                 f"{now[:16]}; the labels were made anew meanwhile"
             )
         rows = dataset.read_file(path)
-        names = ("scene_id", "plan_id", "policy", "ambiguous")
-        asked = ("subject", "reference", "query", "relevant")
-        columns = [rows.column(name).to_pylist() for name in (*names, *asked)]
-        sets = self._sets(dataset, shard, predicate) if self.soft else {}
-        found = [
-            (scene, plan, *answer)
-            for scene, plan, policy, ambiguous, *answer in zip(*columns, strict=True)
-            if policy == self.policy and (self.ambiguous or not ambiguous)
+        names = ("policy", "ambiguous", "scene_id", "plan_id")
+        names += ("subject", "reference", "query", "relevant")
+        policies, ties, *columns = (rows[name].to_pylist() for name in names)
+        learned = [
+            policy == self.policy and (self.ambiguous or not tie)
+            for policy, tie in zip(policies, ties, strict=True)
         ]
-        kept = _first_plans(found, self.goals) if self.goals else None
-        for scene, plan, subject, reference, query, relevant in found:
+        scenes, plans, *asked, relevant = ([*compress(each, learned)] for each in columns)
+        if self.soft:
+            sets = self._sets(dataset, shard, predicate)
+            tied = (sets.get(plan, ()) for plan in plans)
+            relevant = map(target, asked[-1], relevant, tied)
+        kept = _first_plans(scenes, plans, self.goals) if self.goals else None
+        by_goal = groupby(
+            zip(scenes, plans, *asked, map(float, relevant), strict=True), itemgetter(0, 1, 2, 3)
+        )
+        for (scene, plan, subject, reference), found in by_goal:
             if kept is None or plan in kept:
-                relevant = target(query, relevant, sets.get(plan, ()))
-                yield scene, Answer(subject, reference, query, relevant)
+                *_, queries, answers = zip(*found, strict=True)
+                yield scene, Answer(subject, reference, queries, answers)
 
     def _sets(
         self, dataset: Dataset, shard: Shard, predicate: Predicate
@@ -210,12 +219,12 @@ def _first(shards: Sequence[Shard], enough: Callable[[str], float]) -> list[Shar
     return kept
 
 
-def _first_plans(rows: Sequence[tuple[Any, ...]], most: int) -> set[str]:
+def _first_plans(scenes: Sequence[str], plans: Sequence[str], most: int) -> set[str]:
     """Of the plans of each scene, those with the first ids, which are hashes: any ones."""
-    plans: dict[str, set[str]] = {}
-    for scene, plan, *_ in rows:
-        plans.setdefault(scene, set()).add(plan)
-    return {plan for some in plans.values() for plan in sorted(some)[:most]}
+    found: dict[str, set[str]] = {}
+    for scene, plan in zip(scenes, plans, strict=True):
+        found.setdefault(scene, set()).add(plan)
+    return {plan for some in found.values() for plan in sorted(some)[:most]}
 
 
 def one_labelling(dataset: Files, split: str, policy: str) -> None:

@@ -6,8 +6,9 @@ pixels, h and w the same at stride 4.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,26 +17,27 @@ from torch import Tensor
 
 from relevance.models import GEOMETRY, PATCH, STRIDE, mirrored, true_geometry
 from relevance.sampling import Randomisation, same_view, view_of
-from relevance.scene import PREDICATES, Camera, Predicate, Scene, scene_from_json
-from relevance.store import DatasetError, Sample, decode
+from relevance.scene import PREDICATES, Camera, Predicate, scene_from_json
+from relevance.store import DatasetError, decoded, scene_text
 
 _RANDOM = Randomisation(camera_shift=0.03, camera_fov=2.0)
 """As far as cameras can be drawn from the one that a model is told of."""
 
 
 class Answer(NamedTuple):
-    """One label."""
+    """The labels of one goal, or some of them."""
 
     subject: str
     reference: str
-    query: str
-    relevant: float
-    """1 or 0; a share of the sets that tie where labels are soft."""
+    queries: tuple[str, ...]
+    relevant: tuple[float, ...]
+    """Of each query 1 or 0; a share of the sets that tie where labels are soft."""
 
-    @property
-    def about_goal(self) -> bool:
-        """Whether the goal itself names the object."""
-        return self.query in (self.subject, self.reference)
+    def extended(self, more: Answer) -> Answer:
+        """This one and some more labels of its goal."""
+        return self._replace(
+            queries=self.queries + more.queries, relevant=self.relevant + more.relevant
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,11 +45,11 @@ class Example:
     """A scene of a shard, undecoded, and its labels."""
 
     members: Mapping[str, Any]
-    """As `decode` takes them."""
+    """As `decoded` takes them."""
     family: str
     """What kind of scene it is."""
     answers: Mapping[Predicate, Sequence[Answer]]
-    """By predicate, in stored order."""
+    """By predicate, of each goal in stored order."""
 
     @property
     def name(self) -> str:
@@ -126,17 +128,14 @@ def batch_of(
     Without `pictures` those are blank. Raises DatasetError for a picture of another size than the
     camera's, another view, and for a label about an object that its scene has not.
     """
-    samples = [decode(example.members) for example in examples] if pictures else []
-    scenes = [sample.scene for sample in samples] or [_scene(example) for example in examples]
-    for example, scene in zip(examples, scenes, strict=True):
-        _check(example, scene, camera)
-    count, most = len(scenes), max((len(scene.objects) for scene in scenes), default=1)
+    known = [_known(*scene_text(example.members), camera) for example in examples]
+    count, most = len(known), max((len(one.names) for one in known), default=1)
     geometry = np.zeros((count, most, GEOMETRY), np.float32)
     present = np.zeros((count, most), bool)
-    for i, scene in enumerate(scenes):
-        geometry[i, : len(scene.objects)] = true_geometry(scene)
-        present[i, : len(scene.objects)] = True
-    image, views, cells = _pictures(samples, camera, count, most)
+    for i, one in enumerate(known):
+        geometry[i, : len(one.names)] = one.geometry
+        present[i, : len(one.names)] = True
+    image, views, cells = _pictures(examples if pictures else (), known, camera, most)
     return Batch(
         image=image,
         views=views,
@@ -145,96 +144,96 @@ def batch_of(
         told=not pictures,
         names=tuple(example.name for example in examples),
         families=tuple(example.family for example in examples),
-        objects=tuple(tuple(scene.names) for scene in scenes),
+        objects=tuple(one.names for one in known),
         geometry=torch.from_numpy(geometry),
-        turns=tuple((p, *_goals(examples, scenes, p, most)) for p in predicates),
+        turns=tuple((p, *_goals(examples, known, p, most)) for p in predicates),
     )
 
 
-def _scene(example: Example) -> Scene:
-    members = example.members
-    return scene_from_json(members["scene.json"], where=f"{members['__url__']}: {example.name}")
+class _Known(NamedTuple):
+    """What of a scene is learned from, besides its pictures."""
+
+    names: tuple[str, ...]
+    geometry: np.ndarray
+    """(N, GEOMETRY)."""
 
 
-def _check(example: Example, scene: Scene, camera: Camera) -> None:
+@lru_cache(maxsize=2**16)
+def _known(text: bytes, where: str, camera: Camera) -> _Known:
+    """Read a scene and check that the camera saw it: once, since every epoch has it again."""
+    scene = scene_from_json(text, where=where)
     its = scene.camera
     if (its.width, its.height) != (camera.width, camera.height):
         raise DatasetError(
-            f"{example.members['__url__']}: scene {example.name}: image is "
-            f"{its.width}x{its.height}, expected {camera.width}x{camera.height}"
+            f"{where}: image is {its.width}x{its.height}, expected {camera.width}x{camera.height}"
         )
     if not same_view(its, camera, _RANDOM):
         raise DatasetError(
-            f"{example.members['__url__']}: scene {example.name}: seen from {view_of(its)}, "
-            f"expected the model's camera, {view_of(camera)}"
+            f"{where}: seen from {view_of(its)}, expected the model's camera, {view_of(camera)}"
         )
+    return _Known(scene.names, true_geometry(scene))
 
 
 def _pictures(
-    samples: Sequence[Sample], camera: Camera, count: int, most: int
+    examples: Sequence[Example], known: Sequence[_Known], camera: Camera, most: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Image, views and cells, see `Batch`; blank and without memory where nothing was decoded."""
-    image = torch.zeros((), dtype=torch.uint8).expand(count, 3, camera.height, camera.width)
-    views = image[:, :1, :1, :1].unsqueeze(1).expand(count, most, 3, PATCH, PATCH)
-    cells = image[:, 0, ::STRIDE, ::STRIDE]
-    if not samples:
-        return image, views, cells
-    images, masks = (
-        np.stack([getattr(sample, what) for sample in samples]) for what in ("image", "mask")
-    )
-    padded = np.zeros((count, most, PATCH, PATCH, 3), np.uint8)
-    for i, sample in enumerate(samples):
-        padded[i, : len(sample.views)] = sample.views
+    """Image, views and cells, see `Batch`; blank and without memory without examples."""
+    count = len(known)
+    if not examples:
+        image = torch.zeros((), dtype=torch.uint8).expand(count, 3, camera.height, camera.width)
+        views = image[:, :1, :1, :1].unsqueeze(1).expand(count, most, 3, PATCH, PATCH)
+        return image, views, image[:, 0, ::STRIDE, ::STRIDE]
+    images = np.zeros((count, camera.height, camera.width, 3), np.uint8)
+    views = np.zeros((count, most, PATCH, PATCH, 3), np.uint8)
+    masks = np.zeros((count, camera.height, camera.width), np.uint8)
+    for i, (example, one) in enumerate(zip(examples, known, strict=True)):
+        images[i], views[i, : len(one.names)], masks[i] = decoded(example.members, len(one.names))
     return (
         torch.from_numpy(images).permute(0, 3, 1, 2),
-        torch.from_numpy(padded).permute(0, 1, 4, 2, 3),
+        torch.from_numpy(views).permute(0, 1, 4, 2, 3),
         torch.from_numpy(masks[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE].copy()),
     )
 
 
 def _goals(
-    examples: Sequence[Example], scenes: Sequence[Scene], predicate: Predicate, most: int
+    examples: Sequence[Example], known: Sequence[_Known], predicate: Predicate, most: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The goals of a predicate: pairs, relevant and labelled, see `Batch.turns`."""
-    asked = [goals_of(example.answers.get(predicate, ())) for example in examples]
+    asked = [example.answers.get(predicate, ()) for example in examples]
     shape = len(examples), max([1, *map(len, asked)])
     pairs = np.zeros((*shape, 2), np.int64)
     relevant, labelled = (np.zeros((*shape, most), kind) for kind in (np.float32, bool))
-    for i, (example, scene) in enumerate(zip(examples, scenes, strict=True)):
-        place = {name: at for at, name in enumerate(scene.names)}
-        for g, goal in enumerate(asked[i]):
+    for i, (example, one) in enumerate(zip(examples, known, strict=True)):
+        place = {name: at for at, name in enumerate(one.names)}
+        for g, answer in enumerate(asked[i]):
             try:
-                pairs[i, g] = place[goal[0].subject], place[goal[0].reference]
-                queries = [place[answer.query] for answer in goal]
+                pairs[i, g] = place[answer.subject], place[answer.reference]
+                queries = [place[query] for query in answer.queries]
             except KeyError as error:
                 raise DatasetError(
                     f"{example.members['__url__']}: scene {example.name}: labels of {predicate} "
                     f"name {error}, expected one of {', '.join(place)}"
                 ) from None
-            relevant[i, g, queries] = [answer.relevant for answer in goal]
+            relevant[i, g, queries] = answer.relevant
             labelled[i, g, queries] = True
     return torch.from_numpy(pairs), torch.from_numpy(relevant), torch.from_numpy(labelled)
 
 
-def goals_of(answers: Iterable[Answer]) -> list[list[Answer]]:
-    """The answers of each goal."""
-    found: dict[tuple[str, str], list[Answer]] = {}
-    for answer in answers:
-        found.setdefault((answer.subject, answer.reference), []).append(answer)
-    return list(found.values())
-
-
 def in_the_mirror(batch: Batch) -> Batch:
     """The batch as a mirror shows it: y changes sign, left and right change places."""
-    return replace(
-        batch,
-        image=batch.image.flip(-1),
-        cells=batch.cells.flip(-1),
-        geometry=mirrored(batch.geometry),
-        turns=tuple((PREDICATES[turn[0].mirror], *turn[1:]) for turn in batch.turns),
-    )
+    turns = tuple((PREDICATES[turn[0].mirror], *turn[1:]) for turn in batch.turns)
+    found = replace(batch, geometry=mirrored(batch.geometry), turns=turns)
+    if batch.told:  # there is nothing to see
+        return found
+    return replace(found, image=batch.image.flip(-1), cells=batch.cells.flip(-1))
 
 
-def recolored(batch: Batch, channels: Tensor) -> Batch:
+def recolored(batch: Batch, channels: Sequence[int]) -> Batch:
     """The batch with its colour channels in another order, image and views alike."""
-    return replace(batch, image=batch.image[:, channels], views=batch.views[:, :, channels])
+    if batch.told:
+        return batch
+    image, views = (
+        torch.stack([picture[..., channel, :, :] for channel in channels], dim=-3)
+        for picture in (batch.image, batch.views)
+    )
+    return replace(batch, image=image, views=views)

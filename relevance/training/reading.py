@@ -16,7 +16,6 @@ from functools import partial
 from itertools import chain, count, islice
 
 import numpy as np
-import torch
 
 from relevance.errors import RelevanceError
 from relevance.scene import PREDICATES, Predicate
@@ -27,7 +26,6 @@ from relevance.training.examples import (
     Batch,
     Example,
     batch_of,
-    goals_of,
     in_the_mirror,
     recolored,
 )
@@ -178,8 +176,10 @@ class Reader:
         for example in self.catalogue.read(shard, predicates):
             for predicate, answers in example.answers.items():
                 for answer in answers:
-                    if self.config.goal_objects or not answer.about_goal:
-                        yield replace(example, answers={predicate: (answer,)})
+                    for query, relevant in zip(answer.queries, answer.relevant, strict=True):
+                        if self.config.goal_objects or query not in answer[:2]:
+                            alone = answer._replace(queries=(query,), relevant=(relevant,))
+                            yield replace(example, answers={predicate: (alone,)})
 
     # batches ----------------------------------------------------------------------------------
 
@@ -199,7 +199,7 @@ class Reader:
         batch = batch_of(examples, look.predicates, config.model.camera, pictures=pictures)
         rng = _rng(config.seed, 2, look.predicates, look.number)
         if config.recolor:
-            batch = recolored(batch, torch.from_numpy(rng.permutation(3)))
+            batch = recolored(batch, rng.permutation(3).tolist())
         return in_the_mirror(batch) if config.mirror and rng.integers(2) else batch
 
     def _asked(self, look: Look) -> Batch:
@@ -210,10 +210,9 @@ class Reader:
         """The example with at most `goals_per_scene` goals of each predicate."""
         most, kept = self.config.goals_per_scene, dict(example.answers)
         for predicate, answers in example.answers.items():
-            goals = goals_of(answers)
-            if len(goals) > most:
-                drawn = np.sort(rng.permutation(len(goals))[:most])
-                kept[predicate] = [answer for goal in drawn for answer in goals[goal]]
+            if len(answers) > most:
+                drawn = np.sort(rng.permutation(len(answers))[:most])
+                kept[predicate] = [answers[goal] for goal in drawn]
         return replace(example, answers=kept)
 
 
@@ -229,19 +228,25 @@ def _cut(
 def _objects(example: Example) -> int:
     """How many objects the scene has: labels are about all of them."""
     (answers, *_) = example.answers.values()
-    return len({answer.query for answer in answers})
+    return len(answers[0].queries)
 
 
 def _together(examples: tuple[Example, ...]) -> list[Example]:
     """One example a scene, with all the answers that were drawn of it."""
     found: dict[str, Example] = {}
-    answers: dict[str, dict[Predicate, list[Answer]]] = {}
+    drawn: dict[str, dict[Predicate, dict[tuple[str, ...], Answer]]] = {}
     for example in examples:
         found.setdefault(example.name, example)
-        for predicate, drawn in example.answers.items():
-            own = answers.setdefault(example.name, {})
-            own.setdefault(predicate, []).extend(drawn)
-    return [replace(example, answers=answers[name]) for name, example in found.items()]
+        own = drawn.setdefault(example.name, {})
+        for predicate, answers in example.answers.items():
+            goals = own.setdefault(predicate, {})
+            for answer in answers:
+                before = goals.get(answer[:2])
+                goals[answer[:2]] = before.extended(answer) if before else answer
+    return [
+        replace(example, answers={p: [*goals.values()] for p, goals in drawn[name].items()})
+        for name, example in found.items()
+    ]
 
 
 def _rng(

@@ -100,7 +100,9 @@ class Trainer:
             {"params": [w for w in weights if w.ndim >= 2], "weight_decay": config.weight_decay},
             {"params": [w for w in weights if w.ndim < 2], "weight_decay": 0.0},
         ]
-        self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate, betas=config.betas)
+        self.optimizer = torch.optim.AdamW(
+            groups, lr=config.learning_rate, betas=config.betas, fused=True
+        )
         self.bfloat16 = use_bfloat16(config.bfloat16, self.device)
 
     def rate(self, step: int) -> float:
