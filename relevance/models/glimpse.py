@@ -15,6 +15,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from relevance.configs import config
 from relevance.models.config import PATCH, Encoding, ModelConfig, Sight, divides
@@ -98,7 +99,7 @@ class GlimpseBody(Thinker):
         # Begins with two convolutions, of the colours and of where the object was found.
         self.look = small_cnn(1, (32, 64, 64), width)
         colours = nn.Conv2d(3, 32, 8, stride=4, padding=2)
-        self.colours = colours.to(memory_format=torch.channels_last)
+        self.colours = convert_conv2d_weight_memory_format(colours, torch.channels_last)
         seen = 2 * width + 4
         self.estimate = nn.Sequential(nn.Linear(seen, width), nn.GELU(), nn.Linear(width, GEOMETRY))
         self.seen = nn.Sequential(nn.Linear(seen + GEOMETRY, width), nn.GELU())

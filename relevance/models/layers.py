@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from relevance.models.config import PATCH, Answer, Sight
 from relevance.models.tracing import attend, reshaped, shares, tracing
@@ -146,7 +147,7 @@ def small_cnn(channels: int, widths: tuple[int, int, int], width: int) -> nn.Seq
     )
     # Learned so, they cost a quarter less on a CPU. (Not all convolutions: those of 1x1 with a
     # stride corrupt memory in torch 2.13.)
-    return layers.to(memory_format=torch.channels_last)
+    return convert_conv2d_weight_memory_format(layers, torch.channels_last)
 
 
 def extractor(heads: nn.ModuleDict, name: str) -> Extractor:
