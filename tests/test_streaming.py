@@ -462,6 +462,16 @@ def test_another_camera(root: Path, camera: dict, message: str) -> None:
     refused(root, replace(CONFIG, model=model), message)
 
 
+@pytest.mark.parametrize(
+    ("member", "pictures"), [("scene.json", True), ("scene.json", False), ("views.webp", True)]
+)
+def test_a_sample_that_lacks_a_member(made: Path, member: str, pictures: bool) -> None:
+    whole = examples(made)[0]
+    kept = {name: content for name, content in whole.members.items() if name != member}
+    with pytest.raises(DatasetError, match=f"{whole.name}: expected member {member}, found none"):
+        batch_of([replace(whole, members=kept)], SAME_PLANE, Camera(), pictures=pictures)
+
+
 def test_more_objects_than_a_mask_tells_apart(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("relevance.training.catalogue.MOST_OBJECTS", 2)
     refused(root, CONFIG, r"shard 0 of split train has a scene of \d objects, expected at most 2")
