@@ -147,9 +147,8 @@ class Catalogue:
         dataset = Dataset.open(self.root)  # anew: connections to object stores survive no fork
         found: dict[str, dict[Predicate, list[Answer]]] = {}
         for predicate in predicates:
-            for scene, rows in groupby(self._answers(dataset, shard, predicate), itemgetter(0)):
-                answers = found.setdefault(scene, {}).setdefault(predicate, [])
-                answers.extend(answer for _, answer in rows)
+            for scene, answer in self._answers(dataset, shard, predicate):
+                found.setdefault(scene, {}).setdefault(predicate, []).append(answer)
         for members in dataset.undecoded(self.split, shard.number) if found else ():
             if answers := found.pop(members["__key__"], None):
                 yield Example(members=members, family=shard.family, answers=answers)
