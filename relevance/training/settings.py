@@ -160,8 +160,7 @@ class TrainConfig:
         """
         return cls(
             preset="laptop",
-            steps=30_000,
-            scenes_per_batch=8,
+            steps=15_000,
             goals_per_scene=3,
             learning_rate=1.5e-3,
             told_share=0.1,
