@@ -87,7 +87,7 @@ class Sight:
     place: Tensor
     """(K,) the object's place in the scene."""
     geometry: Tensor
-    """(K, GEOMETRY) estimated, decimetres."""
+    """(..., K, GEOMETRY) estimated, decimetres; several guesses of which each is better."""
     match: Tensor
     """(K, P) logits of which cell of an even grid over the image shows it."""
     grid: tuple[int, int]

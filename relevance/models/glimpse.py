@@ -19,8 +19,10 @@ from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from relevance.configs import config
 from relevance.models.config import PATCH, Encoding, ModelConfig, Sight, divides
+from relevance.models.edges import Looker
 from relevance.models.layers import Attention, columns, small_cnn, unshuffled
-from relevance.models.reasoning import APART, BETWEEN, Between, Thinker, apart
+from relevance.models.poses import half_extents
+from relevance.models.reasoning import APART, BETWEEN, Between, apart
 from relevance.models.registry import BODIES, BodyKind
 from relevance.models.tracing import sums, tracing, windows
 from relevance.networks import DECIMETRE, GEOMETRY
@@ -32,8 +34,8 @@ _AROUND = 28
 """How far from its likeliest place an object is looked for, in pixels either way."""
 _NOBODY = -1e4
 """What contends for no cell."""
-_FINE = 2 * PATCH
-"""Samples along the edge of a window, which has as many pixels: a box is placed by its edges."""
+_LOOK = 8, 16, 32
+"""Channels of the glimpse."""
 _OFF = 0.1
 """What a box's middle may well be off from where it is seen, in u and v."""
 _GROUND = 0.035
@@ -55,7 +57,7 @@ class GlimpseConfig(ModelConfig):
     channels: Annotated[int, Field(ge=2)] = 32
     """E, channels of the feature map."""
     window: Annotated[int, Field(ge=1)] = 64
-    """Edge of the image window around a matched object, pixels; looked at by 64 samples."""
+    """Edge of the image window around a matched object, pixels; looked at by 32 samples."""
 
     @model_validator(mode="after")
     def _even(self) -> Self:
@@ -68,7 +70,7 @@ class GlimpseConfig(ModelConfig):
         return cls(width=32, heads=2, layers=1, channels=8)
 
 
-class GlimpseBody(Thinker):
+class GlimpseBody(Looker):
     """Find each object, look at it closely, then reason about the goal over all objects.
 
     Match: dot product of the view's embedding with a map of features, for whose cells the objects
@@ -76,8 +78,9 @@ class GlimpseBody(Thinker):
     image window there goes through a small CNN together with the match map of the same window.
     Both say how the box appears (how far its middle is from there, its height, its apparent sizes),
     which the camera makes geometry of; that is settled with what lies between the objects known:
-    what a box stands on tells whether it is a small one near by or a large one behind. From there
-    on it is the body `geometry`, told what was estimated and what was seen besides.
+    what a box stands on tells whether it is a small one near by or a large one behind. That is a
+    few millimetres off, and put right by a closer look at where the edges should be. From there on
+    it is the body `geometry`, told what was estimated and what was seen besides.
     """
 
     def __init__(self, config: GlimpseConfig, predicates: Sequence[str]) -> None:
@@ -96,21 +99,23 @@ class GlimpseBody(Thinker):
         self.view = small_cnn(3, (channels // 2, channels, channels), width)
         self.view_key = nn.Linear(width, channels)
         self.sharpness = nn.Parameter(torch.tensor(2.5))
-        # Begins with two convolutions, of the colours and of where the object was found.
-        self.look = small_cnn(1, (32, 64, 64), width)
-        colours = nn.Conv2d(3, 32, 8, stride=4, padding=2)
+        # Begins with two convolutions, of the colours and of where the object was found. Small,
+        # since what is precise is seen at the edges.
+        self.look = small_cnn(1, _LOOK, width)
+        colours = nn.Conv2d(3, _LOOK[0], 4, stride=2, padding=1)
         self.colours = convert_conv2d_weight_memory_format(colours, torch.channels_last)
         seen = 2 * width + 4
         self.estimate = nn.Sequential(nn.Linear(seen, width), nn.GELU(), nn.Linear(width, GEOMETRY))
+        self.estimate[-1].bias.data = _cube()  # so that edges are looked for around objects
         self.seen = nn.Sequential(nn.Linear(seen + GEOMETRY, width), nn.GELU())
         self.between = Between(APART)
         self.settle = nn.ModuleList(
             Attention(width, config.heads, expansion=2, between=BETWEEN) for _ in range(2)
         )
-        self.correct, self.carry = nn.Linear(width, GEOMETRY), nn.Linear(width, width)
-        for layer in (self.correct, self.carry):  # at first nothing is added to what was there
-            nn.init.zeros_(layer.weight)
-            nn.init.zeros_(layer.bias)
+        self.correct = nn.Linear(width, GEOMETRY)
+        nn.init.zeros_(self.correct.weight)  # at first nothing is added to what was there
+        nn.init.zeros_(self.correct.bias)
+        self.looks(width)
         self.thinks(width, config.heads, config.layers, predicates)
         self.cells_P2: Tensor
         self.register_buffer("cells_P2", _cell_centres(config.camera), persistent=False)
@@ -147,12 +152,16 @@ class GlimpseBody(Thinker):
         for layer in self.settle:
             x = layer(x, allowed, between)
         geometry = _placed(centre_BN2, apparent + self.correct(x).float(), self.camera)
-        encoding = self.thought(self.token(geometry) + self.carry(x), present, geometry)
+        encoding, guesses = self.looked(image, x, geometry, present, self.camera)
         if self.training:
             at = scene_K, place_K = present.nonzero(as_tuple=True)
             grid = image.shape[-2] // _CELL, image.shape[-1] // _CELL
             sight = Sight(
-                scene=scene_K, place=place_K, geometry=geometry[at], match=match_BNP[at], grid=grid
+                scene=scene_K,
+                place=place_K,
+                geometry=torch.stack([guess[at] for guess in guesses]),
+                match=match_BNP[at],
+                grid=grid,
             )
             encoding = replace(encoding, sight=sight)
         return encoding
@@ -171,26 +180,29 @@ class GlimpseBody(Thinker):
     def _windows(
         self, image: Tensor, where_BNP: Tensor, centre_BN2: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Windows around the centres: colours (B*N, 3, 64, 64) and match maps (B*N, 1, 32, 32)."""
+        """Windows around the centres: colours (B*N, 3, 32, 32) and match maps (B*N, 1, 32, 32)."""
         batch, objects = where_BNP.shape[:2]
         height, width = image.shape[-2:]
         if tracing():
             map_NHW = where_BNP[0].unflatten(-1, (height // _CELL, width // _CELL))
-            peak, _ = windows(map_NHW[:, None], centre_BN2[0], self.window / _CELL, own=True)
-            colours, inside = windows(image, centre_BN2[0], self.window, own=False, samples=_FINE)
-            return colours - inside / 2, peak / where_BNP[0].amax(-1)[:, None, None, None]
+            peak = windows(map_NHW[:, None], centre_BN2[0], self.window / _CELL, own=True)
+            colours = windows(image, centre_BN2[0], self.window, own=False)
+            return colours - 0.5, peak / where_BNP[0].amax(-1)[:, None, None, None]
         edge = image.new_tensor([self.window / width, self.window / height])
-        fine, coarse = (
-            centre_BN2[:, :, None, None] + _square(n, image.device) * edge for n in (_FINE, PATCH)
-        )
-        colours = F.grid_sample(
-            image - 0.5, fine.view(batch, objects * _FINE, _FINE, 2), align_corners=False
-        )
-        colours = colours.view(batch, 3, objects, _FINE, _FINE).transpose(1, 2)
+        square_BNPP2 = centre_BN2[:, :, None, None] + _square(PATCH, image.device) * edge
+        colours = F.grid_sample(image, square_BNPP2.view(batch, -1, PATCH, 2), align_corners=False)
+        colours = colours.view(batch, 3, objects, PATCH, PATCH).transpose(1, 2)
         shape = (batch * objects, 1, height // _CELL, width // _CELL)
         peak = (where_BNP / where_BNP.amax(-1, keepdim=True)).view(shape)
-        heat = F.grid_sample(peak, coarse.view(-1, PATCH, PATCH, 2), align_corners=False)
-        return colours.reshape(-1, 3, _FINE, _FINE), heat
+        heat = F.grid_sample(peak, square_BNPP2.flatten(0, 1), align_corners=False)
+        return colours.flatten(0, 1) - 0.5, heat
+
+
+def _cube() -> Tensor:
+    """How a cube of 7 cm appears, GEOMETRY, that stands square where it is seen."""
+    edge = torch.full((), 2 * _GROUND / DECIMETRE)
+    extents = half_extents(edge, edge, torch.zeros(()))
+    return torch.cat([torch.zeros(3), edge.expand(3), extents])
 
 
 def _square(count: int, device: torch.device) -> Tensor:
@@ -240,7 +252,7 @@ BODIES.register(
     BodyKind(
         config=GlimpseConfig,
         make=GlimpseBody,
-        version="5",
+        version="6",
         advantage="sees the views of all objects, learned from masks and poses, and reckons what "
         "is in the hand's way where it sees them",
     ),

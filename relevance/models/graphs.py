@@ -15,14 +15,27 @@ import torch
 from torch import Tensor, nn
 
 from relevance.models.config import PATCH, Encoding, ModelConfig
+from relevance.models.edges import Looker
 from relevance.models.reasoning import Thinker
 from relevance.models.registry import RelevanceModel
 from relevance.networks import GEOMETRY, WEIGHTS, label
+from relevance.networks.edges import EDGES, LINES, SAMPLES
 from relevance.networks.obstruction import OBSTRUCTION
 from relevance.scene import PREDICATES
 
 _OPSET = 20
 _SEEN = ("tokens", "geometry", "scene")
+_VARIES = {
+    "views": {0: "N"},
+    "poses": {0: "N"},
+    **{name: {1: "N"} for name in ("tokens", "geometry", "known", "expected", "shown")},
+    **{name: {1: "N"} for name in ("lines", "turn", "half")},
+    **{name: {1: "N", 2: "N"} for name in ("picks", "between")},
+    "goals": {0: "G"},
+    "places": {1: "G", 2: "N"},
+    "scores": {0: "G", 1: "N"},
+}
+"""By name, which sizes are those of a scene or of a question."""
 
 
 class _Encoder(nn.Module):
@@ -56,6 +69,33 @@ class _Between(nn.Module):
         return self.body.between_all(geometry, picks)
 
 
+class _Closer(nn.Module):
+    """From where objects are expected and what shows there to where they are; see `Edges`."""
+
+    def __init__(self, body: Looker) -> None:
+        super().__init__()
+        self.body = body
+
+    def forward(self, *given: Tensor) -> tuple[Tensor, Tensor]:
+        return self.body.edges(*given)
+
+
+class _Known(nn.Module):
+    """As `_Between`, from objects whose edges were looked at; and their tokens."""
+
+    def __init__(self, body: Looker) -> None:
+        super().__init__()
+        self.body = body
+
+    def forward(
+        self, known: Tensor, shown: Tensor, geometry: Tensor, picks: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        present = known.new_ones(known.shape[:2], dtype=torch.bool)
+        tokens = self.body.known(known, shown, geometry)
+        thought = self.body.thought(tokens, present, geometry).tokens
+        return thought, self.body.between_all(geometry, picks)
+
+
 class _Decoder(nn.Module):
     """From the parts of an encoding and goals (G, 2) to scores (G, N)."""
 
@@ -80,8 +120,9 @@ class _Decoder(nn.Module):
 
 
 def export_graphs(model: RelevanceModel) -> dict[str, bytes]:
-    """The graphs that a `GraphNetwork` runs: `encode`, `between` of bodies that are told what is in
-    the way, and one for each predicate.
+    """The graphs that a `GraphNetwork` runs: `encode`, `edges` of bodies that look closer at where
+    they expect objects, `between` of those that are told what is in the way, and one for each
+    predicate.
 
     Raises RuntimeError, or what the body raises, where a body cannot be traced.
     """
@@ -95,44 +136,49 @@ def _graphs(config: ModelConfig, predicates: tuple[str, ...]) -> tuple[tuple[str
         model = RelevanceModel(config, predicates).eval()
         for weight in model.parameters():
             nn.init.uniform_(weight)  # equal ones would be taken for one
-    camera, objects = config.camera, 3
-    if model.told:
-        given: dict[str, Tensor] = {"poses": torch.ones(objects, GEOMETRY)}
-    else:
-        given = {
-            "image": torch.zeros(3, camera.height, camera.width, dtype=torch.uint8),
-            "views": torch.zeros(objects, 3, PATCH, PATCH, dtype=torch.uint8),
-        }
-    varies = {"views": {0: "N"}, "poses": {0: "N"}, "tokens": {1: "N"}, "geometry": {1: "N"}}
-    varies |= {"picks": {1: "N", 2: "N"}, "between": {1: "N", 2: "N"}}
-    varies |= {"goals": {0: "G"}, "places": {1: "G", 2: "N"}, "scores": {0: "G", 1: "N"}}
+    camera, objects, body = config.camera, 3, model.body
+    values = {
+        "poses": torch.ones(objects, GEOMETRY),
+        "image": torch.zeros(3, camera.height, camera.width, dtype=torch.uint8),
+        "views": torch.zeros(objects, 3, PATCH, PATCH, dtype=torch.uint8),
+        "picks": torch.zeros(1, objects, objects, OBSTRUCTION),
+        "places": torch.zeros(1, 2, objects, OBSTRUCTION),
+        "lines": torch.zeros(1, objects, EDGES, LINES, 3 * SAMPLES),
+        "turn": torch.zeros(1, objects),
+        "half": torch.ones(1, objects, 2),
+        "goals": torch.tensor([[0, 1], [1, 2]]),
+    }
+    graphs: dict[str, bytes] = {}
+
+    def add(name: str, module: nn.Module, takes: Sequence[str], gives: Sequence[str]) -> None:
+        given = {one: values[one] for one in takes}
+        found = module(*given.values())
+        values.update(zip(gives, found if isinstance(found, tuple) else (found,), strict=True))
+        graphs[name] = _traced(module, given, gives)
+
     with torch.no_grad():
-        encoder = _Encoder(model)
-        found = encoder(*given.values())
         whole = model.encode(
-            torch.zeros(1, 3, camera.height, camera.width),
-            torch.zeros(1, objects, 3, PATCH, PATCH),
-            poses=torch.ones(1, objects, GEOMETRY),
+            values["image"][None], values["views"][None], poses=values["poses"][None]
         )
         seen = [name for name in _SEEN if getattr(whole, name) is not None]
-        graphs = {"encode": _traced(encoder, given, seen, varies)}
-        parts = dict(zip(seen, found, strict=True))
-        if isinstance(model.body, Thinker):
-            told = {"geometry": parts["geometry"]}
-            told["picks"] = torch.zeros(1, objects, objects, OBSTRUCTION)
-            graphs["between"] = _traced(_Between(model.body), told, ["between"], varies)
-            assert whole.between is not None
-            parts["between"] = whole.between
-            parts["places"] = torch.zeros(1, 2, objects, OBSTRUCTION)
+        closer = isinstance(body, Looker)
+        given = ["poses"] if model.told else ["image", "views"]
+        add("encode", _Encoder(model), given, ["known", "expected"] if closer else seen)
+        if closer:
+            expected = ["known", "expected", "lines", "turn", "half"]
+            add("edges", _Closer(body), expected, ["geometry", "shown"])
+            shown = ["known", "shown", "geometry", "picks"]
+            add("between", _Known(body), shown, ["tokens", "between"])
+        elif isinstance(body, Thinker):
+            add("between", _Between(body), ["geometry", "picks"], ["between"])
+        if isinstance(body, Thinker):
+            seen += ["between", "places"]
         for name in predicates:
-            inputs = parts | {"goals": torch.tensor([[0, 1], [1, 2]])}
-            graphs[name] = _traced(_Decoder(model, name, list(parts)), inputs, ["scores"], varies)
+            add(name, _Decoder(model, name, seen), [*seen, "goals"], ["scores"])
     return tuple(graphs.items())
 
 
-def _traced(
-    module: nn.Module, given: dict[str, Tensor], outputs: Sequence[str], varies: dict
-) -> bytes:
+def _traced(module: nn.Module, given: dict[str, Tensor], outputs: Sequence[str]) -> bytes:
     """A module as a graph without its weights.
 
     torch's older exporter: a hundred times faster than its newer one, which matters to whoever
@@ -148,7 +194,7 @@ def _traced(
             dynamo=False,
             input_names=list(given),
             output_names=list(outputs),
-            dynamic_axes={k: v for k, v in varies.items() if k in given or k in outputs},
+            dynamic_axes={k: v for k, v in _VARIES.items() if k in given or k in outputs},
             opset_version=_OPSET,
             do_constant_folding=False,
         )

@@ -219,4 +219,4 @@ def model_config(values: Any) -> Any:
 
 
 def _unit(x: Tensor) -> Tensor:
-    return x.float() / 255 if x.dtype == torch.uint8 else x
+    return x.float().div_(255) if x.dtype == torch.uint8 else x

@@ -32,18 +32,15 @@ def sums(x_BEK: Tensor) -> Tensor:
     return x_BEK.new_ones(1, x_BEK.shape[1]) @ x_BEK if tracing() else x_BEK.sum(1, keepdim=True)
 
 
-def windows(
-    maps_MCHW: Tensor, centre_N2: Tensor, edge: float, *, own: bool, samples: int = PATCH
-) -> tuple[Tensor, Tensor]:
-    """Squares around centres (u and v in -1..1), resampled: (N, C, S, S).
+def windows(maps_MCHW: Tensor, centre_N2: Tensor, edge: float, *, own: bool) -> Tensor:
+    """Squares around centres (u and v in -1..1), resampled: (N, C, 32, 32).
 
-    Of the one map, or of each object's own. And how much of each sample is inside of the map,
-    (N, 1, S, S): outside is nothing. Samples lie on rows and columns, so that a square is
-    a small part of the map, copied in tiles, between two small matrices; GridSample takes twice
-    as long.
+    Of the one map, or of each object's own; outside is nothing. Samples lie on rows and columns,
+    so that a square is a small part of the map, copied in tiles, between two small matrices;
+    GridSample takes twice as long.
     """
     channels, height, width = maps_MCHW.shape[1:]
-    step_S = ((torch.arange(samples) + 0.5) / samples - 0.5) * edge - 0.5
+    step_S = ((torch.arange(PATCH) + 0.5) / PATCH - 0.5) * edge - 0.5
     middle_N2 = (centre_N2 + 1) * torch.tensor([width / 2, height / 2])
     x_NS, y_NS = (middle_N2[:, axis, None] + step_S for axis in range(2))
     tile = math.gcd(_TILE, width)
@@ -61,9 +58,8 @@ def windows(
     cut = maps_MCHW.reshape(-1, tile)[place_NK].view(-1, channels * rows, tiles * tile)
     across_NSR = _taps(x_NS - x_N1 * tile, tiles * tile)
     down_NSR = _taps(y_NS - y_N1, rows)
-    cut = (cut @ across_NSR.transpose(1, 2)).view(-1, channels, rows, samples)
-    inside = down_NSR.sum(-1)[:, None, :, None] * across_NSR.sum(-1)[:, None, None]
-    return down_NSR[:, None] @ cut, inside
+    cut = (cut @ across_NSR.transpose(1, 2)).view(-1, channels, rows, PATCH)
+    return down_NSR[:, None] @ cut
 
 
 def _taps(at_NS: Tensor, count: int) -> Tensor:

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 import onnxruntime
 
+from relevance.networks.edges import ROUNDS, expected_edges
 from relevance.networks.files import Checkpoint, CheckpointError
 from relevance.networks.obstruction import obstructed_goals, obstructed_picks
 from relevance.networks.poses import GEOMETRY
@@ -71,8 +72,10 @@ class Network(Protocol):
 class GraphNetwork:
     """The network of a checkpoint in ONNX Runtime, on one thread; a `Network`.
 
-    The graph `encode` has inputs `image` and `views`, or `poses`; `between`, if there is one, takes
-    its `geometry` and `picks`; that of a predicate takes what these give, by name, `goals`, and
+    The graph `encode` has inputs `image` and `views`, or `poses`; `edges`, if there is one, takes
+    what is `known` of objects where they are `expected`, and what shows there
+    (`relevance.networks.edges`), and gives `geometry`, which is expected next; `between`, if there
+    is one, takes what these give, by name, and `picks`; that of a predicate likewise, `goals`, and
     `places` if it is told (`relevance.networks.obstruction`). It is loaded when it is first asked.
     """
 
@@ -89,49 +92,65 @@ class GraphNetwork:
         self._values: dict[str, onnxruntime.OrtValue] = {}
         self._sessions: dict[str, onnxruntime.InferenceSession] = {}
         self._taken: dict[str, list[str]] = {}
-        self._encode = self._session("encode")
-        self._seen = [output.name for output in self._encode.get_outputs()]
-        self._between = self._session("between") if "between" in checkpoint.graphs else None
-        if self._between is not None:  # its kernels are compiled or loaded before a look's clock
+        self._given: dict[str, list[str]] = {}
+        self._session("encode")
+        self._closer, self._obstructed = (one in checkpoint.graphs for one in ("edges", "between"))
+        # Kernels are compiled or loaded before a look's clock.
+        if self._closer:
+            blank = np.zeros((1, 3, 2, 2), np.uint8)
+            expected_edges(
+                blank, np.ones((1, 1, GEOMETRY), np.float32), _all(blank[:, :1]), self.camera
+            )
+        if self._obstructed:
+            self._session("between")
             nothing = np.ones((1, 2, GEOMETRY), np.float32)
             obstructed_picks(nothing, _all(nothing))
             goals = np.array([[[0, 1]]])
             obstructed_goals(nothing, _all(nothing), PREDICATES["on"], goals)
-        self.told = [one.name for one in self._encode.get_inputs()] == ["poses"]
+        self.told = self._taken["encode"] == ["poses"]
 
     def look(
         self, image: np.ndarray, views: np.ndarray, poses: np.ndarray | None
     ) -> dict[str, Any]:
         """As `Network.look`."""
         if self.told:
-            given = {"poses": poses}
+            given: dict[str, Any] = {"poses": poses}
         else:
             given = {
                 "image": np.ascontiguousarray(image.transpose(2, 0, 1)),
                 "views": np.ascontiguousarray(views.transpose(0, 3, 1, 2)),
             }
-        seen = dict(zip(self._seen, self._encode.run(None, given), strict=True))
-        if self._between is not None:
-            where = np.asarray(seen["geometry"])
-            told = {"geometry": where, "picks": obstructed_picks(where, _all(where))}
-            (seen["between"],) = self._between.run(None, told)
+        seen = self._run("encode", given)
+        for _ in range(ROUNDS if self._closer else 0):
+            where = seen["expected"]
+            edges = expected_edges(given["image"][None], where, _all(where), self.camera)
+            seen |= self._run("edges", seen | edges._asdict())
+            seen["expected"] = seen["geometry"]
+        if self._obstructed:
+            where = seen["geometry"]
+            seen |= self._run("between", seen | {"picks": obstructed_picks(where, _all(where))})
         return seen
 
     def judge(
         self, seen: Mapping[str, np.ndarray], predicate: Predicate, goals: np.ndarray
     ) -> np.ndarray:
         """As `Network.judge`."""
-        session = self._session(predicate.name)
-        given = {name: seen[name] for name in self._taken[predicate.name] if name in seen}
+        self._session(predicate.name)
+        given = {**seen, "goals": goals}
         if "places" in self._taken[predicate.name]:
             where = seen["geometry"]
             given["places"] = obstructed_goals(where, _all(where), predicate, goals[None])
-        (scores,) = session.run(None, given | {"goals": goals})
-        return np.asarray(scores)
+        return self._run(predicate.name, given)["scores"]
 
     def believed(self, seen: Mapping[str, np.ndarray]) -> np.ndarray | None:
         """As `Network.believed`."""
         return seen["geometry"][0] if "geometry" in seen else None
+
+    def _run(self, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        """What a graph gives, by name; of the values it takes its own."""
+        session = self._session(name)
+        found = session.run(None, {one: values[one] for one in self._taken[name]})
+        return dict(zip(self._given[name], map(np.asarray, found), strict=True))
 
     def _session(self, name: str) -> onnxruntime.InferenceSession:
         if name not in self._sessions:
@@ -141,8 +160,8 @@ class GraphNetwork:
                     f"was trained on {', '.join(self.predicates)}"
                 )
             self._sessions[name] = self._load(name)
-            inputs = (one.name for one in self._sessions[name].get_inputs())
-            self._taken[name] = [one for one in inputs if one != "goals"]
+            self._taken[name] = [one.name for one in self._sessions[name].get_inputs()]
+            self._given[name] = [one.name for one in self._sessions[name].get_outputs()]
         return self._sessions[name]
 
     def _load(self, name: str) -> onnxruntime.InferenceSession:

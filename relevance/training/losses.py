@@ -69,7 +69,8 @@ def _look_losses(sights: Sequence[Sight], batch: Batch) -> dict[str, Tensor]:
     """How far from masks and poses objects were seen, the mean over all looks.
 
     mask, attention: cross entropy between where an object was seen and where the mask shows it.
-    geometry: smooth L1 in decimetres, position, size and half-extents weighing the same.
+    geometry: smooth L1 in decimetres, position, size and half-extents weighing the same; summed
+    over the guesses.
     """
     found: dict[str, list[Tensor]] = {}
     for sight in sights:
@@ -78,7 +79,11 @@ def _look_losses(sights: Sequence[Sight], batch: Batch) -> dict[str, Tensor]:
         found.setdefault("mask", []).append(_mask_loss(sight.match, shown))
         if sight.attention is not None:
             found.setdefault("attention", []).append(_mask_loss(sight.attention, shown))
-        error = F.smooth_l1_loss(sight.geometry, batch.geometry[at], beta=0.02, reduction="none")
+        truth = batch.geometry[at]
+        error = F.smooth_l1_loss(
+            sight.geometry, truth.expand_as(sight.geometry), beta=0.02, reduction="none"
+        )
+        error = error.reshape(-1, *truth.shape).sum(0)
         parts = [error[:, a:b].mean() for a, b in ((0, 3), (3, 6), (6, GEOMETRY))]
         found.setdefault("geometry", []).append(torch.stack(parts).sum())
     return {name: torch.stack(values).mean() for name, values in found.items()}
