@@ -20,7 +20,6 @@ from relevance.networks.obstruction import (
     PICK_WAYS,
     PLACE_WAYS,
     SOFTNESS,
-    boxes_of,
     goal_region,
     hold,
     obstructed_goals,
@@ -28,6 +27,7 @@ from relevance.networks.obstruction import (
     obstruction,
     place_gaps,
 )
+from relevance.networks.poses import boxes_of
 from relevance.planner.pose import FAMILIES, PoseBound
 from relevance.planner.problem import Problem
 from relevance.scene import PREDICATES, Box, Goal, Predicate, Robot, Scene

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from relevance.networks.poses import ANGLES, DECIMETRE
+from relevance.networks.poses import DECIMETRE, boxes_of
 from relevance.scene import Camera, pinhole
 
 ROUNDS = 2
@@ -45,7 +45,7 @@ class Expected(NamedTuple):
     lines: np.ndarray
     """(B, N, EDGES, LINES, 3 SAMPLES) float32: colours from within to without, less their mean."""
     turn: np.ndarray
-    """(B, N) float32: of the footprint, -pi / 4 to pi / 4."""
+    """(B, N) float32: of the footprint, some -pi / 4 to pi / 4."""
     half: np.ndarray
     """(B, N, 2) float32: half extents of the footprint along and across that, decimetres."""
 
@@ -74,37 +74,28 @@ def _look(image, unit, geometry, present, eye, axes, focal, found):
     """Fill `found`."""
     lines, turns, halves = found
     for b in range(len(geometry)):
-        for n in np.flatnonzero(present[b]):
-            box = geometry[b, n]
-            turn, ahead, aside = rectangle(box[6:])
-            turns[b, n], halves[b, n, 0], halves[b, n, 1] = turn, ahead, aside
-            half = np.array([ahead, aside]) * DECIMETRE
-            middle = box[:3] * DECIMETRE - eye
+        there = np.flatnonzero(present[b])
+        boxes = boxes_of(geometry[b], there)
+        for k in range(len(there)):
+            n, box, half = there[k], boxes[k], np.maximum(boxes[k, 4:6], _SMALLEST)
+            turn = box[3]
+            if turn > math.pi / 4:  # the same rectangle, less turned
+                turn, half = turn - math.pi / 2, half[::-1].copy()
+            turns[b, n], halves[b, n] = turn, half / DECIMETRE
             cos, sin = math.cos(turn), math.sin(turn)
+            # As the camera has them: the box's middle, and its axes.
+            middle = axes.T @ (box[:3] - eye)
+            ahead, left, up = cos * axes[0] + sin * axes[1], cos * axes[1] - sin * axes[0], axes[2]
             for edge in range(EDGES):
-                rise = (0.5 if edge < len(_SIDES) else -0.5) * box[5] * DECIMETRE
-                out = _SIDES[edge % len(_SIDES)]
+                x, y = _SIDES[edge % len(_SIDES)]
+                face = middle + (box[6] if edge < len(_SIDES) else -box[6]) * up
+                step = STEP * (x * ahead + y * left)
                 for line in range(LINES):
                     share = _REACH * (2 * line / (LINES - 1) - 1)
-                    first = np.empty(2)
-                    for axis in range(2):
-                        along = out[axis] + share * (1 - abs(out[axis]))
-                        first[axis] = half[axis] * along - STEP * (SAMPLES - 1) / 2 * out[axis]
-                    start = np.empty(3)
-                    start[0] = middle[0] + first[0] * cos - first[1] * sin
-                    start[1] = middle[1] + first[0] * sin + first[1] * cos
-                    start[2] = middle[2] + rise
-                    step = np.zeros(3)
-                    step[0] = STEP * (out[0] * cos - out[1] * sin)
-                    step[1] = STEP * (out[0] * sin + out[1] * cos)
-                    _sample(
-                        image[b],
-                        unit,
-                        axes.T @ start,
-                        axes.T @ step,
-                        focal,
-                        lines[b, n, edge, line],
-                    )
+                    along, across = x + share * (1 - abs(x)), y + share * (1 - abs(y))
+                    start = face + half[0] * along * ahead + half[1] * across * left
+                    start -= (SAMPLES - 1) / 2 * step
+                    _sample(image[b], unit, start, step, focal, lines[b, n, edge, line])
 
 
 @njit(cache=True)
@@ -130,30 +121,3 @@ def _sample(image, unit, ray, step, focal, found):
     for s in range(SAMPLES):
         for channel in range(3):
             found[3 * s + channel] -= mean[channel]
-
-
-@njit(cache=True)
-def rectangle(extents):
-    """Turn and half extents of the rectangle that has these extents (ANGLES,) best.
-
-    The turn is that of their fourth harmonic, which a square has, too; the half extents, along and
-    across, are the nearest ones by least squares.
-    """
-    cos = sin = 0.0
-    for k in range(ANGLES):
-        cos -= extents[k] * math.cos(4 * math.pi / ANGLES * k)
-        sin -= extents[k] * math.sin(4 * math.pi / ANGLES * k)
-    turn = math.atan2(sin, cos) / 4
-    squares, both, sums = np.zeros(2), 0.0, np.zeros(2)
-    for k in range(ANGLES):
-        along = abs(math.cos(math.pi / ANGLES * k - turn))
-        across = abs(math.sin(math.pi / ANGLES * k - turn))
-        squares[0] += along * along
-        squares[1] += across * across
-        both += along * across
-        sums[0] += along * extents[k]
-        sums[1] += across * extents[k]
-    parts = squares[0] * squares[1] - both * both
-    ahead = (squares[1] * sums[0] - both * sums[1]) / parts
-    aside = (squares[0] * sums[1] - both * sums[0]) / parts
-    return turn, max(ahead, _SMALLEST / DECIMETRE), max(aside, _SMALLEST / DECIMETRE)

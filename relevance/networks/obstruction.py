@@ -17,9 +17,9 @@ from numba import njit
 from relevance.holding.clearances import clearance, pick_gaps
 from relevance.holding.hand import MARGIN, PICK_MARGIN, REGION_MARGIN, TILTS, hand_boxes
 from relevance.holding.holds import COLUMNS, sound_holds
-from relevance.networks.poses import ANGLES, DECIMETRE
+from relevance.networks.poses import boxes_of
 from relevance.scene import Predicate, Robot
-from relevance.scene.geometry import UPRIGHT, extents, rectangle_gap, upright
+from relevance.scene.geometry import extents, rectangle_gap
 from relevance.scene.predicates import GAP
 
 ROBOT = Robot()
@@ -254,37 +254,3 @@ def goal_region(subject, reference, stacked, toward, area):
         else:
             area[a] += toward[a] * (low + GAP / 2)
             area[3 + a] = GAP / 2 if abs(toward[a]) > 0.5 else wide[a]
-
-
-@njit(cache=True)
-def boxes_of(geometry, there):
-    """Boxes (K, UPRIGHT) from rows `there` (K,) of geometry (N, GEOMETRY), which has half extents
-    in the place of a yaw; of either pair of edges.
-
-    Those at right angles add up to sqrt(2) (along + across) cos(yaw + pi / 4 - angle), but for a
-    kink where the angle is the yaw: next to the direction in which the sum is least. So the other
-    three of four give the yaw.
-    """
-    boxes = np.empty((len(there), UPRIGHT))
-    step, quarter = math.pi / ANGLES, ANGLES // 2
-    for n in range(len(there)):
-        row = geometry[there[n]] * DECIMETRE
-        least = 0
-        for k in range(1, quarter):
-            if row[6 + k] + row[6 + k + quarter] < row[6 + least] + row[6 + least + quarter]:
-                least = k
-        k = (least + 1) % quarter
-        before = row[6 + k] + row[6 + k + quarter]
-        k = (least + quarter - 1) % quarter
-        after = row[6 + k] + row[6 + k + quarter]
-        off = (after - before) / max(after + before, 1e-7) / math.tan(step)
-        yaw = (least + quarter // 2) * step + math.atan(off) - math.pi / 4
-        cc = cs = ss = own = other = 0.0
-        for k in range(ANGLES):
-            c, s = abs(math.cos(k * step - yaw)), abs(math.sin(k * step - yaw))
-            cc, cs, ss = cc + c * c, cs + c * s, ss + s * s
-            own, other = own + row[6 + k] * c, other + row[6 + k] * s
-        of = cc * ss - cs * cs
-        along, across = (own * ss - other * cs) / of, (other * cc - own * cs) / of
-        upright(row[0], row[1], row[2], yaw, along, across, row[5] / 2, boxes[n])
-    return boxes
