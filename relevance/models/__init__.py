@@ -8,7 +8,8 @@ does not depend on the query, and do the rest anew for each. Every predicate has
   at position zero). With `shared` attention image tokens never see object tokens, which is
   what makes one encoding serve all goals exactly; `trio` is the paper's own.
 - `resnet`, `resnet3d`: the paper's two others.
-- `glimpse`: finds each object by matching its view with the image, looks at a window around it.
+- `glimpse`: finds each object by matching its view with the image, looks at a window around it,
+  then closer at where its edges should be.
 - `geometry`: no picture, the true poses.
 
 A body is a file of this package that registers itself; nothing else names it.
