@@ -81,6 +81,15 @@ def test_a_box_that_is_off_shows_it_by_as_much() -> None:
             assert np.median(at) == pytest.approx(sign * off, abs=1.5 * STEP)
 
 
+def test_what_is_expected_nowhere_shows_nothing() -> None:
+    geometry = np.repeat(true_geometry(scene()), 4, axis=0)
+    geometry[0, 0], geometry[1, 9], geometry[2, :3] = np.nan, np.inf, 1e30
+    lines = seen(np.random.default_rng(0).integers(0, 256, (192, 320, 3), np.uint8), geometry)
+    assert not lines[:2].any()
+    assert np.isfinite(lines).all()
+    assert lines[3].any()
+
+
 def test_nobody_moves_a_box_before_it_has_learned() -> None:
     """What is put right is the box itself then, and what is not there is nothing."""
     edges = Edges(width=8, hidden=16)

@@ -40,7 +40,8 @@ _SIDES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
 class Expected(NamedTuple):
-    """Boxes as they are expected, and what shows at their edges; zero for what is not there."""
+    """Boxes as they are expected, and what shows at their edges; zero for what is not there, and
+    for boxes that are expected at no finite place."""
 
     lines: np.ndarray
     """(B, N, EDGES, LINES, 3 SAMPLES) float32: colours from within to without, less their mean."""
@@ -65,7 +66,8 @@ def expected_edges(
         half=np.zeros((*shape, 2), np.float32),
     )
     unit = 1 / 255 if image.dtype == np.uint8 else 1.0
-    _look(image, unit, geometry, present, *pinhole(camera), found)
+    finite = present & np.isfinite(geometry).all(-1)  # a network that diverges must not crash
+    _look(image, unit, geometry, finite, *pinhole(camera), found)
     return found
 
 
