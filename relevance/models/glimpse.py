@@ -189,7 +189,7 @@ class GlimpseBody(Looker):
             colours = windows(image, centre_BN2[0], self.window, own=False)
             return colours - 0.5, peak / where_BNP[0].amax(-1)[:, None, None, None]
         edge = image.new_tensor([self.window / width, self.window / height])
-        square_BNPP2 = centre_BN2[:, :, None, None] + _square(PATCH, image.device) * edge
+        square_BNPP2 = centre_BN2[:, :, None, None] + _square(image.device) * edge
         colours = F.grid_sample(image, square_BNPP2.view(batch, -1, PATCH, 2), align_corners=False)
         colours = colours.view(batch, 3, objects, PATCH, PATCH).transpose(1, 2)
         shape = (batch * objects, 1, height // _CELL, width // _CELL)
@@ -205,9 +205,9 @@ def _cube() -> Tensor:
     return torch.cat([torch.zeros(3), edge.expand(3), extents])
 
 
-def _square(count: int, device: torch.device) -> Tensor:
-    """Centres of count x count cells of a square, (count, count, 2): u and v, each in -1..1."""
-    step = (torch.arange(count, device=device) + 0.5) / count * 2 - 1
+def _square(device: torch.device) -> Tensor:
+    """Centres of 32 x 32 cells of a square, (32, 32, 2): u and v, each in -1..1."""
+    step = (torch.arange(PATCH, device=device) + 0.5) / PATCH * 2 - 1
     return torch.stack(torch.meshgrid(step, step, indexing="xy"), -1)
 
 
@@ -253,7 +253,7 @@ BODIES.register(
         config=GlimpseConfig,
         make=GlimpseBody,
         version="6",
-        advantage="sees the views of all objects, learned from masks and poses, and reckons what "
-        "is in the hand's way where it sees them",
+        advantage="sees the views of all objects, learned from masks and poses, looks for the "
+        "edges of boxes where it expects them, and reckons what is in the hand's way there",
     ),
 )
