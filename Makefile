@@ -1,9 +1,12 @@
 # make demo    install, run the whole pipeline on a small dataset, say where the report is
 # make test    install with the test tools, run the default tests
+# make test-slow     the tests that take minutes
 # make test-browser  install with playwright, open every page in Chromium
 # make check   formatting, lint, types, and the order of imports
+# make format  put formatting and imports right
 # make drawing write the drawing of the rooms and the map of the files into CONTRIBUTING.md
 # make deploy  register the flows with a running Prefect server
+# make clean   delete what was installed and built, not datasets
 
 PYTHON ?= python3
 DATASET ?= data/demo

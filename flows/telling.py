@@ -2,8 +2,9 @@
 
 The resource of every event is `relevance.dataset.PATH`; its payload names the dataset, so that a
 trigger can hand it to a deployment (prefect.yaml). Events: `shards.written` (`relevance.table` of
-the resource is scenes or labels), `checkpoint.promoted`, and the troubles, which also leave an
-artifact of their name with a dash.
+the resource is scenes or labels), `checkpoint.promoted` and `checkpoint.refused`, and the troubles
+`shard.failed`, `labels.shifted` and `check.failed`, which also leave an artifact of their name with
+a dash.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ CHECK_FAILED = "check.failed"
 """A dataset breaks its contracts."""
 PROMOTED, REFUSED = "checkpoint.promoted", "checkpoint.refused"
 """What became of a checkpoint that was tried."""
-TROUBLES = (SHARD_FAILED, LABELS_SHIFTED, CHECK_FAILED, REFUSED)
 
 
 def tell(dataset: Path, event: str, *, resource: dict[str, str] | None = None, **told: Any) -> None:

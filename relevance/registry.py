@@ -1,4 +1,4 @@
-"""Variants by name: predicates, bodies, guides, planners and label policies are registered."""
+"""Variants by name: predicates, bodies, guides, planners, label policies, ... are registered."""
 
 from __future__ import annotations
 

@@ -203,6 +203,7 @@ def test_what_has_no_oracle_yet_is_left_out():
     assert figures([rerun(0, "glimpse", u=0.010, g=0.006)]) == []
     measured = measured_guides([])
     assert [table.rows for table in measured.tables] == [()] * 5
+    assert measured.plots == ()
 
 
 def test_the_command_writes_rows_tables_and_plots_and_goes_on(tmp_path, capsys):

@@ -446,6 +446,4 @@ def test_steps_within_no_time_are_one_round():
         "fair, alone": [1, 1],
         "bare": [4, 1],
         "long": shared,
-        "fair, no goal objects": shared,
-        "fair, soft labels": shared,
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 import torch
@@ -27,8 +28,8 @@ ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture(scope="module")
-def root() -> Path:
-    return ruled()
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return Path(copytree(ruled(), tmp_path_factory.mktemp("shipping") / "dataset"))
 
 
 def test_shipped_models_are_halved_and_say_how_they_are_made(
@@ -49,8 +50,9 @@ def test_shipped_models_are_halved_and_say_how_they_are_made(
     assert {key: meta[key] for key in meta} == {key: known[key] for key in meta}
     page = path.with_suffix(".md").read_text()
     config = TrainConfig.from_dict(meta["config"])
-    made = command(config, root)
-    assert made == f"relevance ship {root} {' '.join(flags)}"
+    made = command(config, root, "mine")
+    assert made == f"relevance ship {root} {' '.join(flags)} --name mine"
+    assert made.startswith(f"{command(config, root, 'geometry')} ")
     assert all(part in page for part in (made, meta["dataset_hash"], "| same-plane |"))
 
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,6 +36,7 @@ from relevance.training import (
     batch_of,
     load_checkpoint,
     polling,
+    ranks,
     train,
 )
 from relevance.training.examples import in_the_mirror
@@ -316,9 +318,23 @@ def test_two_processes_train_as_one(made: Path, root: Path, tmp_path: Path) -> N
     assert len(Dataset.open(root).read_rows("checkpoints")) == 1, "the first one writes, alone"
     single = train(Path(shutil.copytree(made, tmp_path / "single")), config)
     assert single.name == path.name
-    alone = load_checkpoint(single)[1]["history"]
-    for a, b in zip(meta["history"], alone, strict=True):
+    alone = load_checkpoint(single)[1]
+    for a, b in zip(meta["history"], alone["history"], strict=True):
         assert a["loss"] == pytest.approx(b["loss"], rel=0.1)
+    assert [meta["scenes"], meta["asked"]] == [alone["scenes"], alone["asked"]]
+
+
+def test_processes_count_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One met `stacks` first, another never met `on`."""
+    counts = [{"on": 1, "stacks": 2}, {"stacks": 30, "on": 40}, {"stacks": 500}]
+
+    def gather(found: list[Any], own: Any) -> None:
+        assert own == counts[0]
+        found[:] = counts
+
+    monkeypatch.setattr(ranks.distributed, "all_gather_object", gather)
+    assert ranks.Ranks(count=3).totals(counts[0]) == {"on": 41, "stacks": 532}
+    assert ranks.ALONE.totals(counts[0]) == counts[0]
 
 
 # --- memory -------------------------------------------------------------------------------

@@ -371,6 +371,12 @@ def test_studies_run_where_planner_and_command_line_are_not(tmp_path: Path) -> N
     assert done.stdout.split()[:2] == ["bodies", "data"]
 
 
+@pytest.mark.parametrize("minutes", ["0", "-1", "nan", "inf"])
+def test_a_study_takes_time(minutes: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert main(["study", str(tmp_path), "data", "--minutes", minutes]) == 2
+    assert f"--minutes {float(minutes)}: expected a number over 0" in capsys.readouterr().err
+
+
 @pytest.mark.slow  # worker processes load torch
 def test_the_command_writes_tables_and_pictures(tiny: str, tmp_path: Path, capsys: Any) -> None:
     root, out = copied(tmp_path, of=small_dataset), tmp_path / "out"

@@ -130,6 +130,8 @@ def test_a_checkpoint_from_elsewhere_is_judged_and_complete_guides_lose_nothing(
         warnings.simplefilter("ignore", RelevanceWarning)
         predict(root, checkpoint)
         assert evaluate(root, checkpoint, config) == 5 * len(complete)
+    rows = read_evaluations(dataset, checkpoint_id(checkpoint))
+    assert {row["suite"] for row in rows} == {"robot-elsewhere"}
     [row] = away([root], checkpoint)
     assert row["dataset"] == "robot-elsewhere"
     assert row["goals"] > 0
@@ -142,14 +144,14 @@ def test_a_checkpoint_from_elsewhere_is_judged_and_complete_guides_lose_nothing(
 def test_a_complete_guide_that_lost_a_task_would_show(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from relevance.evaluation import suites
+    from relevance.evaluation import elsewhere
 
     root, checkpoint = evaluated()
     base = read_evaluations(Dataset.open(root), checkpoint_id(checkpoint))[0]
     base |= {"guide": "order", "solved_unguided": True}
     rows = [base | {"solved_guided": True}, base | {"solved_guided": False}]
-    monkeypatch.setattr(suites, "read_evaluations", lambda *_: rows)
-    found = suites._reruns(Dataset.open(root), "")
+    monkeypatch.setattr(elsewhere, "read_evaluations", lambda *_: rows)
+    found = elsewhere._reruns(Dataset.open(root), "")
     assert (found["solved"], found["solved_guided"]) == (1.0, 0.5)
 
 

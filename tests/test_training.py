@@ -97,10 +97,13 @@ def test_rounds_have_a_batch_of_each_in_every_step(made: Path) -> None:
     assert trainer.take(ahead)["loss"] == pytest.approx(np.mean(parts), rel=1e-5)
 
 
-def test_one_by_one_trains_each_for_its_share_of_the_steps(made: Path) -> None:
-    config = replace(CONFIG, polling="one-by-one", steps=10, share_encodings=False, mirror=False)
-    seen = [draw_batch(made, config, step).turns[0][0] for step in range(10)]
-    assert seen == [p for p in PREDICATES.values() for _ in range(2)]
+@pytest.mark.parametrize("share", [True, False])
+def test_one_by_one_trains_each_for_its_share_of_the_steps(made: Path, share: bool) -> None:
+    config = replace(CONFIG, polling="one-by-one", steps=10, share_encodings=share, mirror=False)
+    seen = [draw_batch(made, config, step).turns for step in range(10)]
+    assert [[turn[0] for turn in turns] for turns in seen] == [
+        [p] for p in PREDICATES.values() for _ in range(2)
+    ]
 
 
 def test_queries_are_drawn_uniformly(made: Path) -> None:

@@ -256,3 +256,5 @@ def test_the_command_films_a_scene_file(tmp_path: Path, monkeypatch, capsys) -> 
     films = ("--gif", str(tmp_path / "a.gif"), "--mp4", str(tmp_path / "a.mp4"))
     assert main(["view", str(file), "--goal", GOAL, *films]) == 0
     assert "a.gif" in capsys.readouterr().err
+    unguided = ("--guide", "none", "--checkpoint", "geometry")
+    assert main(["view", str(file), "--goal", GOAL, *films, *unguided]) == 0

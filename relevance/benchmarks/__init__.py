@@ -1,4 +1,4 @@
-"""Measurements of the planner on fresh random tasks: nothing here prints, the command line does.
+"""Measurements of planner, guides, networks and datasets: nothing prints, the command line does.
 
 Each part is one function that does the work and returns a `Measured`: rows for a file, tables
 for a person, and what its plots need. Times are CPU seconds of this process (all its threads)

@@ -208,7 +208,7 @@ def measured_guides(rows: Sequence[Rerun]) -> Measured:
             every_table(every, without),
             limit_table(rows),
         ),
-        plots=tuple(plots),
+        plots=tuple(plots) if found else (),
     )
 
 

@@ -152,16 +152,19 @@ def _accuracy(rows: tuple[Seen, ...], eyes: str, mind: str) -> Table:
         rows=tuple(
             (
                 told,
-                *(
-                    f"{100 * row.true_relevant:.1f} / {100 * row.true_irrelevant:.1f} / "
-                    f"{100 * row.total:.1f}"
-                    for group in groups
-                    for row in [by[told, group]]
-                ),
+                *(_shares(by.get((told, group))) for group in groups),
             )
             for told in named
         ),
     )
+
+
+def _shares(row: Seen | None) -> str:
+    """Of a group that a network has a head for."""
+    if row is None:
+        return "-"
+    shares = row.true_relevant, row.true_irrelevant, row.total
+    return " / ".join(f"{100 * share:.1f}" for share in shares)
 
 
 def _distances(millimetres: np.ndarray, eyes: str) -> Table:

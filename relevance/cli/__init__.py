@@ -29,8 +29,9 @@ from relevance.errors import RelevanceError, RelevanceWarning
 FAULT = 70
 """Exit code of a fault of this project (EX_SOFTWARE of sysexits.h)."""
 CODES = (
-    "exit codes: 0 done, 1 a check failed or a replay refused a plan, 2 you can mend it (one line\n"
-    f"says what), 130 interrupted, {FAULT} a fault of relevance: please report its traceback"
+    "exit codes: 0 done, 1 a check failed, a replay refused a plan or a trial a contender,\n"
+    "2 you can mend it (one line says what), 130 interrupted,\n"
+    f"{FAULT} a fault of relevance: please report its traceback"
 )
 
 

@@ -1,4 +1,4 @@
-"""Subcommands that ask a dataset: check, sql, stats, suites, report."""
+"""Subcommands that ask a dataset: check, sql, stats, diff, suites, report."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import dataclasses

@@ -136,7 +136,7 @@ def _bench(_: Preset) -> Callable[..., int]:
     ) -> int:
         """Measure how datasets are made, read and asked, and kill processes that make one.
 
-        Writes tables and a CSV file for each part; the datasets themselves are not kept.
+        Prints tables and writes a CSV file for each part; the datasets themselves are not kept.
 
         Args:
             scenes: Scenes of each family whose goals are labelled, once by 1 process and once by 2;
@@ -145,7 +145,7 @@ def _bench(_: Preset) -> Callable[..., int]:
             shards: Files that they are in, for each predicate.
             kills: How often the making of a small dataset is disturbed.
             seed: Remakes an earlier run; a fresh one when not given.
-            out: Folder for tables and rows; data/bench/dataset-SEED when not given.
+            out: Folder for rows and plots; data/bench/dataset-SEED when not given.
             parts: What to measure.
         """
         for flag, count in (("scenes", scenes), ("rows", rows), ("shards", shards)):
@@ -271,7 +271,7 @@ def _sight(_: Preset) -> Callable[..., int]:
             told: Checkpoint of a body that is told that.
             split: Whose scenes.
             scenes: The first so many of each shard.
-            out: Folder for the tables and their rows as CSV; data/bench/sight when not given.
+            out: Folder for tables (summary.json) and rows (CSV); data/bench/sight when not given.
         """
         from relevance.benchmarks.sight import measure_sight
 
@@ -282,7 +282,7 @@ def _sight(_: Preset) -> Callable[..., int]:
             measured = measure_sight(
                 dataset, sees=sees, told=told, split=split, scenes=scenes, progress=progress
             )
-        hand_over(measured, folder)
+        hand_over(measured, folder, summary=True)
         return 0
 
     return bench

@@ -107,7 +107,7 @@ def _tune(_: Preset) -> Callable[..., int]:
 
         Args:
             dataset: Folder of a labelled dataset.
-            checkpoint: The model, a file or an id; the dataset's newest when not given.
+            checkpoint: The model, a file or an id; the dataset's champion, else its newest.
         """
         from relevance import evaluation
         from relevance.training import find_checkpoint
@@ -179,7 +179,7 @@ def _calibrate(_: Preset) -> Callable[..., int]:
 
         Args:
             dataset: Folder of a labelled dataset whose scenes are drawn as those to come.
-            checkpoint: The model, a file or an id; the dataset's newest when not given.
+            checkpoint: The model, a file or an id; the dataset's champion, else its newest.
             split: Whose scenes; never those that it was trained on.
             format: How to print the rows.
         """
@@ -219,7 +219,7 @@ def _coverage(preset: Preset) -> Callable[..., int]:
 
         Args:
             dataset: Folder of a labelled dataset, any.
-            checkpoint: The model, a file or an id; the dataset's newest when not given.
+            checkpoint: The model, a file or an id; the dataset's champion, else its newest.
             levels: The coverages to look at.
             split: Whose scenes.
             tasks: Goals of each predicate that are also planned, unguided and pruned at every
@@ -253,7 +253,8 @@ def _coverage(preset: Preset) -> Callable[..., int]:
         ]
         show(columns, rows, format, title=f"coverage of {path} on {dataset}")
         if tasks:
-            config = evaluation.EvaluationConfig(tasks=tasks, split=split)
+            guides = "prune", "prune-then-full"  # others leave nothing out
+            config = evaluation.EvaluationConfig(tasks=tasks, split=split, guides=guides)
             with bar("tasks") as progress:
                 speeds = evaluation.covered_speeds(
                     dataset, path, config, levels=levels, progress=progress

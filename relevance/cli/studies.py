@@ -1,6 +1,7 @@
 """The subcommand `study`: many networks trained and judged, in one table."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +11,7 @@ import tyro
 from relevance.cli.arguments import Command, DatasetArg, OptionalCount, Preset, Workers, at_least
 from relevance.cli.bench import hand_over
 from relevance.cli.processes import pools
-from relevance.cli.terminal import bar, say
+from relevance.cli.terminal import UsageError, bar, say
 
 StudyArg = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STUDY")]
 Words = Annotated[tuple[str, ...], tyro.conf.arg(metavar="WORD")]
@@ -58,7 +59,8 @@ def _study(_: Preset) -> Callable[..., int]:
         from relevance.store import replacing
         from relevance.training import Plan, TrainConfig, find_checkpoint, run_study, ship
 
-        at_least("--minutes", minutes, 0)
+        if minutes is not None and not 0 < minutes < math.inf:
+            raise UsageError(f"--minutes {minutes}: expected a number over 0")
         at_least("--goals", goals, 0)
         more = {"only": only, "device": device, "folder": out}
         plan = Plan.of(dataset, study, minutes=minutes, goals=goals, **more)

@@ -78,8 +78,8 @@ def _view(_: Preset) -> Callable[..., int]:
         guides: dict[str, Any] = {"unguided": None}
         if GUIDES[guide].guided and (not films or checkpoint is not None):
             guides[f"guided ({guide})"] = _guide(dataset, checkpoint, guide, beta)
-        if films and checkpoint is not None:
-            del guides["unguided"]
+            if films:
+                del guides["unguided"]  # a film is of one plan
         shots, reasons = shoot(task, guides)
         for reason in reasons:
             say(f"relevance view: {reason}")

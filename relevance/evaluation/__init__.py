@@ -40,6 +40,7 @@ from relevance.evaluation.coverage import (
     out_of_reach,
     read_calibration,
 )
+from relevance.evaluation.elsewhere import away
 from relevance.evaluation.pairing import Asked, Pair, Timed, beside_another, side_by_side
 from relevance.evaluation.pictures import PictureError, Seen, look_at
 from relevance.evaluation.predictions import policy_of_checkpoint, predict, unjudged
@@ -61,7 +62,7 @@ from relevance.evaluation.scorer import (
     load_scorer,
 )
 from relevance.evaluation.scores import scores
-from relevance.evaluation.suites import SUITES, Suite, away, suite_of
+from relevance.evaluation.suites import SUITES, Suite, suite_of
 from relevance.evaluation.tuning import Patience, Tuned, TuningConfig, tune, tune_once
 from relevance.evaluation.working_points import SweptTask, WorkingPoint, saved, swept, working_point
 

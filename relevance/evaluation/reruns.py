@@ -19,6 +19,7 @@ from relevance.evaluation.pairing import Asked, side_by_side
 from relevance.evaluation.predictions import Progress
 from relevance.evaluation.priors import PRIORS, TRUE, prior_scorer
 from relevance.evaluation.scorer import NetworkScorer, load_scorer
+from relevance.evaluation.suites import suite_of
 from relevance.hashing import content_hash
 from relevance.pipeline import DatasetConfig, load_config
 from relevance.planner import GUIDES, PLANNER_VERSION, PlannerConfig, Scorer
@@ -42,8 +43,6 @@ class EvaluationConfig:
     priors: tuple[str, ...] = (TRUE,)
     """Who else gives scores to every guide: true, all, none, random, distance, swept, or another
     checkpoint (a file, or one that comes with the package)."""
-    suite: str = ""
-    """What the tasks are of, where that is not the dataset's own test."""
     beta: float = 0.0
     """The working point: an object is kept iff score > -beta."""
     betas: tuple[float, ...] = (-2.0, 2.0, 4.0)
@@ -220,7 +219,7 @@ def _reruns(
     made = {
         "checkpoint_id": scorer.checkpoint_id,
         "split": config.split,
-        "suite": config.suite or None,
+        "suite": suite_of(dataset),
         "config_hash": hash_of(config),
     }
     others = {name: prior_scorer(name) for name in config.priors}
@@ -255,7 +254,7 @@ def compare(
     """Plan one task unguided and with each guide; one row a search, guide, beta and prior.
 
     `moved` is what a known plan moves, `others` are scorers of the config's priors that are there
-    already; `turn` rotates who goes first; further betas are rerun, with the first search, if
+    already; `turn` draws who goes when; further betas are rerun, with the first search, if
     `swept`. Rows lack checkpoint_id, split, suite and config_hash.
     """
     priors: dict[str, Scorer] = {OWN: scorer}

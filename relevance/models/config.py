@@ -19,7 +19,7 @@ from relevance.scene import Camera
 PATCH = 32
 """Edge of image patches and canonical views, pixels (the paper's)."""
 STRIDE = 4
-"""Image pixels per cell of the feature map on which objects are matched and masks are kept."""
+"""Image pixels per cell of the grid on which masks are kept."""
 
 
 class ModelError(RelevanceError):

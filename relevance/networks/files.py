@@ -40,7 +40,7 @@ class Checkpoint:
     weights: Mapping[str, np.ndarray]
     """By the names that torch has for them."""
     graphs: Mapping[str, bytes] = field(default_factory=dict)
-    """`encode` and one for each predicate (see `GraphNetwork`); none where a body keeps torch."""
+    """Those that a `GraphNetwork` has, by name; none where a body keeps torch."""
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:

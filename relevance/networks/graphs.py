@@ -20,7 +20,7 @@ from relevance.networks.poses import GEOMETRY
 from relevance.scene import PREDICATES, Camera, Predicate
 
 GRAPHS_VERSION = 1
-"""Raised when what goes into graphs and comes out of them changes."""
+"""Raised when graphs of before would be given something else than they take."""
 WEIGHTS = "weights"
 """Where graphs say that their weights are: in the checkpoint beside them."""
 

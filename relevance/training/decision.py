@@ -15,16 +15,22 @@ def offsets(metrics: Mapping[str, Any], before: Mapping[str, float] = {}) -> dic
     total on the validation queries of `metrics`.
 
     eta in the loss shifts that optimum: a network that learned it well has it at
-    -log(eta / (1 - eta)), for 0.86 at about -2. A predicate's own family of scenes says it where
-    it has labels, else the first that borrows the predicate. Predicates of `before` keep theirs;
-    those without validation labels get none.
+    -log(eta / (1 - eta)), for 0.86 at about -2. Predicates of `before` keep theirs; those without
+    validation labels get none.
     """
     found = {}
-    for name, predicate in PREDICATES.items():
-        group = next((g for g in (name, *predicate.also) if g in metrics), None)
+    for name in PREDICATES:
+        group = group_that_decides(name, metrics)
         if group is not None:
             found[name] = metrics[group]["queries"]["best_beta"]
     return {name: beta for name, beta in found.items() if beta is not None} | dict(before)
+
+
+def group_that_decides(predicate: str, metrics: Mapping[str, Any]) -> str | None:
+    """Whose queries choose a predicate's offset: its own family's where it has labels, else those
+    of the first family that borrows it."""
+    groups = predicate, *PREDICATES[predicate].also
+    return next((group for group in groups if group in metrics), None)
 
 
 def yaws(dataset: Dataset) -> list[float]:

@@ -29,7 +29,7 @@ def groups_of(predicates: Sequence[Predicate], config: TrainConfig) -> list[tupl
     decoded twice; not where single queries are drawn or one is trained after the other.
     """
     alone = config.queries_per_batch > 0 or config.polling == "one-by-one"
-    return polling(predicates, share=config.share_encodings or not alone)
+    return polling(predicates, share=not alone)
 
 
 def looks_of(

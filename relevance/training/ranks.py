@@ -6,7 +6,8 @@ Each learns from its share of every batch; gradients are averaged, so all have t
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -59,13 +60,16 @@ class Ranks:
             distributed.all_gather_object(found, names)
         return [name for own in found for name in own]
 
-    def totals(self, counts: Sequence[int]) -> list[int]:
-        """Each count, summed over the processes."""
-        found: list[Sequence[int]] = [counts]
+    def totals(self, counts: Mapping[str, int]) -> dict[str, int]:
+        """Counts by name, summed over the processes, of which each may have met other names."""
+        found: list[Mapping[str, int]] = [counts]
         if self.count > 1:
-            found = [[]] * self.count
+            found = [{}] * self.count
             distributed.all_gather_object(found, counts)
-        return [sum(own) for own in zip(*found, strict=True)]
+        total = Counter[str]()
+        for own in found:
+            total.update(own)
+        return dict(total)
 
     def wait(self) -> None:
         """Wait until all are here."""

@@ -2,9 +2,9 @@
 
 A look is what is decoded at once: some scenes, for predicates that take turns on them. Each group
 of predicates goes through the shards that it has labels in, in an order of each epoch of its own;
-after every few looks (`ALIKE`) no example has come twice more than another. Which look a step
-takes is arithmetic, so a run that goes on begins where it was: what was consumed is passed over
-undecoded.
+after every few looks (`ALIKE`) the numbers of times that two examples came differ by one at most.
+Which look a step takes is arithmetic, so a run that goes on begins where it was: what was consumed
+is passed over undecoded.
 """
 
 from __future__ import annotations

@@ -201,8 +201,7 @@ class TrainConfig:
         ViT's embedding is three convolutions deep. `--model.body` chooses the body, with sizes
         that a CPU can train.
         """
-        fair = replace(cls.demo(), preset="fair", model=BODIES["vit"].config.fair(), steps=4000)
-        return replace(fair, told_share=0.0)
+        return replace(cls.demo(), preset="fair", model=BODIES["vit"].config.fair(), steps=4000)
 
     def with_body(self, body: str) -> Self:
         """The same with another body, of the sizes that it has for this preset."""

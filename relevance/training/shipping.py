@@ -14,6 +14,7 @@ from relevance.configs import dotted
 from relevance.models import BODIES
 from relevance.store import replacing
 from relevance.training.checkpoints import load_checkpoint, save_checkpoint
+from relevance.training.decision import group_that_decides
 from relevance.training.settings import TrainConfig
 from relevance.training.trainer import train
 
@@ -51,12 +52,12 @@ def ship(
 def _card(name: str, root: Path, config: TrainConfig, meta: Mapping[str, Any]) -> str:
     """The page about a model."""
     body = BODIES[config.model.body]
-    offsets = meta.get("offsets", {})
+    chosen = {group_that_decides(name, meta["metrics"]): it for name, it in meta["offsets"].items()}
     rows = [
         f"| {group} | {found['goals']:,} | {q['relevant'] + q['irrelevant']:,} | "
         + " | ".join(_percent(q[key]) for key in ("true_relevant", "true_irrelevant", "total"))
         + f" | {_percent(q['base_rate'])} | {_number(q['auc'])} | "
-        f"{_number(offsets.get(group))} | {_percent(q.get('tuned', {}).get('total'))} |"
+        f"{_number(chosen.get(group))} | {_percent(q.get('tuned', {}).get('total'))} |"
         for group, found in meta["metrics"].items()
         for q in [found["queries"]]
     ]
@@ -69,11 +70,12 @@ A `{config.model.body}` of {meta["parameters"]:,} parameters: it {sees}.
 - checkpoint `{meta["checkpoint_id"]}`, weights halved
 - trained in {meta["train_seconds"] / 60:.1f} minutes on {meta["device"]}, {config.steps:,} \
 steps, on data `{meta["dataset_hash"]}`, labels of policy `{config.policy}`
-- made by `{command(config, root)}`
+- made by `{command(config, root, name)}`
 {_patience(meta)}
 Queries of the validation split (subject and reference left out), the network's own scores at
 beta = 0; the offset is what is added to them, so that beta = 0 is the decision that validation
-chose.
+chose; tuned is the total there. (A predicate that only scenes of another family ask of has its
+offset in that family's row.)
 
 | | goals | queries | true relevant | true irrelevant | total | base rate | AUC | offset | tuned |
 |---|---|---|---|---|---|---|---|---|---|
@@ -88,7 +90,7 @@ def _patience(meta: Mapping[str, Any]) -> str:
     return f"- as `lazy` it looks after work of {meta['patience']:,} (`relevance tune`)\n"
 
 
-def command(config: TrainConfig, root: Path) -> str:
+def command(config: TrainConfig, root: Path, name: str) -> str:
     """The command line that ships this model: the preset, and what differs from it."""
     make = getattr(TrainConfig, config.preset, TrainConfig)
     before = dotted(asdict(make().with_body(config.model.body)))
@@ -99,7 +101,8 @@ def command(config: TrainConfig, root: Path) -> str:
     }
     preset = [f"--preset {config.preset}"] if make is not TrainConfig else []
     words = [f"relevance ship {root}", *preset, f"--model.body {config.model.body}"]
-    return " ".join([*words, *(_flag(key, value) for key, value in changed.items())])
+    words += [_flag(key, value) for key, value in changed.items()]
+    return " ".join(words if name == config.model.body else [*words, f"--name {name}"])
 
 
 def _flag(key: str, value: Any) -> str:

@@ -1,6 +1,6 @@
 """Studies: declared sets of trainings that make a table together, each for some time of a core.
 
-A study is settings alone; `study_runs` trains them. The body or setting that a row of its table
+A study is settings alone; `run_study` trains them. The body or setting that a row of its table
 is about is the run's `label`; runs that differ in their seed alone share it.
 """
 
@@ -89,8 +89,6 @@ RECIPES: dict[str, Callable[[str], Networks]] = {
     "fair, alone": lambda body: _a_family_each(*_fair(body)),
     "bare": _bare,
     "long": _long,
-    "fair, no goal objects": lambda body: (replace(*_fair(body), goal_objects=False),),
-    "fair, soft labels": lambda body: (replace(*_fair(body), soft_labels=True),),
 }
 """By name, from a body to the settings of its networks: `fair`, the help that ours has; `bare`,
 the paper's, at sizes that a CPU can train; `long`, ours for an hour."""

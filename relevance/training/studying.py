@@ -204,8 +204,6 @@ def _alike(plan: Plan, named: Callable[[TrainConfig], str], run: Run) -> str:
         steps=1,
         seed=0,
         continues="",
-        goal_objects=True,
-        soft_labels=False,
         scene_share=1.0,
     )
     return f"{named(alike)} in {plan.seconds(run):g} s, {plan.device}"

@@ -264,7 +264,7 @@ def train(
                     _validate(trainer, validation)
                 if trainer.done % config.save_every == 0 and trainer.done < config.steps:
                     run.save(trainer)
-        scenes, *asked = ranks.totals([trainer.scenes, *trainer.asked.values()])
+        counted = ranks.totals({"scenes": trainer.scenes, **trainer.asked})
         if ranks.first:
             with closing(reader_for(validation, trainer).whole()) as batches:
                 metrics = measure(trainer.model, batches)
@@ -285,8 +285,8 @@ def train(
                 "yaws": yaws(dataset),
                 "history": trainer.history,
                 "validations": trainer.validations,
-                "scenes": scenes,
-                "asked": dict(zip(trainer.asked, asked, strict=True)),
+                "scenes": counted.pop("scenes"),
+                "asked": counted,
             }
             save_checkpoint(path, trainer.model, meta)
             write_row(dataset, path, meta)
