@@ -119,6 +119,7 @@ def test_the_other_defaults_come_from_the_preset(capsys: pytest.CaptureFixture[s
         (["plan", "none.jsonl", "--planner", "his"], "--planner his: expected one of ours, rai"),
         (["bench", "dataset", "--kills", "0"], "--kills 0: expected at least 1"),
         (["generate", "new", "--replay-share", "2"], "DatasetConfig.replay_share = 2.0: expected"),
+        (["generate", "new", "--seed", str(2**63)], "DatasetConfig.seed = 9223372036854775808: "),
         (["plan", "none.jsonl"], "none.jsonl: cannot be read"),
         (["plan", "none.jsonl", "--limit", "0"], "--limit 0: expected at least 1"),
         (["plan", "none.jsonl", "--trajectory", "a.npy"], "a.npy: expected a file that ends in"),
@@ -158,8 +159,9 @@ def _plan(
 
 
 def test_plan_prints_one_json_line_a_goal(tmp_path: Path) -> None:
-    lines = _plan(tmp_path, "--goal", "behind(red, blue)")
-    goals = [*SCENE["goals"], "behind(red, blue)"]
+    more = ["behind(red, blue)", "in-front(red, blue)"]
+    lines = _plan(tmp_path, *(word for goal in more for word in ("--goal", goal)))
+    goals = [*SCENE["goals"], *more]
     assert [line["goal"] for line in lines] == goals
     for line in lines:
         assert set(line) == {

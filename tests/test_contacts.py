@@ -28,6 +28,7 @@ from relevance.scene import (
     read_scenes,
 )
 from relevance.scene.contacts import robot_depth
+from relevance.simulation import Renderer
 
 CASES = Path(__file__).parent / "cases"
 
@@ -338,3 +339,12 @@ def test_an_unknown_object_is_named_safely():
         scene["\x1b" + "x" * 500]
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 120
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_box_level_with_the_camera_is_read_and_drawn():
+    """A face of it is in the plane of the lens: its corners are nowhere in the picture."""
+    level = Camera(eye=(0.0, 0.0, 0.5), target=(0.3, 0.0, 0.5))
+    scene = Scene(objects=(box("a", 0.3), box("b", -0.025, 0.2)), camera=level)
+    mask = Renderer().render(scene).mask
+    assert set(np.unique(mask)) <= {0, 1}

@@ -122,6 +122,8 @@ def test_round_trip_is_exact(x, y, yaw, size):
     [
         (raw(colour="red"), "colour", "unknown field"),
         (changed(0, weight=3), "objects.0.weight", "unknown field"),
+        (changed(0, strength=3), "objects.0.strength", "unknown field"),
+        (changed(0, str=3), "objects.0.str", "unknown field"),
         (raw(objects=[]), "objects", "at least 1 item"),
         (raw(objects=None), "objects", "expected a list"),
         ({"id": "s1"}, "objects", "required"),

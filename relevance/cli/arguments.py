@@ -20,6 +20,8 @@ OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
 OptionalName = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
 OptionalCount = Annotated[int | None, tyro.conf.arg(metavar="N")]
 Workers = Annotated[int, tyro.conf.arg(metavar="N")]
+Repeated = tyro.conf.UseAppendAction[tuple[str, ...]]
+"""A flag that may be given again, one word each time."""
 
 CORES = len(os.sched_getaffinity(0))
 MOST_WORKERS = 1024

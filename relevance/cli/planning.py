@@ -10,7 +10,15 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from relevance.cli.arguments import Command, OptionalPath, Preset, at_least, one_of, settings_of
+from relevance.cli.arguments import (
+    Command,
+    OptionalPath,
+    Preset,
+    Repeated,
+    at_least,
+    one_of,
+    settings_of,
+)
 from relevance.cli.terminal import UsageError, bar, to_json
 
 Name = Annotated[str, tyro.conf.arg(metavar="NAME")]
@@ -25,7 +33,7 @@ def _plan(_: Preset) -> Callable[..., int]:
 
     def plan(
         scenes: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENES")],
-        goal: Annotated[tuple[str, ...], tyro.conf.arg(metavar="GOAL")] = (),
+        goal: Annotated[Repeated, tyro.conf.arg(metavar="GOAL")] = (),
         json: tyro.conf.FlagCreatePairsOff[bool] = False,
         planner: Name = "ours",
         search: Literal["tree", "informed"] = default.search,
@@ -45,7 +53,7 @@ def _plan(_: Preset) -> Callable[..., int]:
 
         Args:
             scenes: JSON file, or JSON lines with one scene a line; - is standard input.
-            goal: Further goals for every scene, e.g. 'on-the-left(red, blue)'.
+            goal: A further goal for every scene, e.g. 'on-the-left(red, blue)'; may be given again.
             json: One JSON line a goal instead of text.
             planner: ours, or rai: rai's own LGP solver (pip install 'relevance[rai]').
             search: The paper's breadth-first tree, or our informed search.
@@ -84,10 +92,9 @@ def _plan(_: Preset) -> Callable[..., int]:
             max_actions=max_actions,
             seconds=seconds,
         )
-        file = Path("/dev/stdin") if str(scenes) == "-" else scenes
         tasks = [
             (scene, scene.goal(text))
-            for scene in read_scenes(file)
+            for scene in read_scenes(scenes)
             for text in (*scene.goals, *goal)
         ]
         if not tasks:

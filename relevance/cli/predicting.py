@@ -9,10 +9,9 @@ from typing import Annotated
 
 import tyro
 
-from relevance.cli.arguments import Command, OptionalPath, Preset, at_least
+from relevance.cli.arguments import Command, OptionalPath, Preset, Repeated, at_least
 from relevance.cli.terminal import Format, UsageError, say, show
 
-Repeated = tyro.conf.UseAppendAction[tuple[str, ...]]
 _CROP = re.compile(r"(?P<name>[^=]+)=(?P<box>\d+,\d+,\d+,\d+)")
 
 

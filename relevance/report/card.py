@@ -70,7 +70,7 @@ def write_card(root: str | Path, out: str | Path) -> Path:
         )
     page = out / PAGE
     temporary = out / f".{PAGE}.{os.getpid()}.tmp"
-    temporary.write_text(card(found, dataset, pictures))
+    temporary.write_text(card(found, dataset, pictures), encoding="utf-8")
     temporary.replace(page)
     return page
 

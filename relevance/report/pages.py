@@ -34,7 +34,7 @@ def write_page(template: str, out: Path, **given: Any) -> Path:
     }
     page = environment.get_template(template).render(given)
     with replacing(out) as temporary:
-        temporary.write_text(page)
+        temporary.write_text(page, encoding="utf-8")
     return out
 
 

@@ -135,10 +135,8 @@ def seconds(value: float | None) -> str:
         return DASH
     if value == 0:
         return "0"
-    if value >= 100:
-        return f"{value:.0f} s"
     if value >= 1:
-        return f"{value:.2g} s" if value >= 10 else f"{value:.1f} s"
+        return f"{value:.0f} s" if value >= 10 else f"{value:.1f} s"
     return f"{1000 * value:.0f} ms" if value >= 0.01 else f"{1000 * value:.1f} ms"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import TypeVar, dataclass_transform
 
 from pydantic import Field, ValidationError
@@ -34,7 +35,7 @@ _SAID_BETTER = {
     "dataclass_type": "expected an object",
     "tuple_type": "expected a list",
 }
-_TRIED = ("function-after[", "tuple[", "str")
+_TRIED = re.compile(r"(function-after|tuple)\[.*|str")
 
 
 def first_error(error: ValidationError) -> str:
@@ -43,7 +44,10 @@ def first_error(error: ValidationError) -> str:
     # A misspelt field is missing and unknown at once: the unknown one says more.
     first = next((e for e in errors if e["type"] == "unexpected_keyword_argument"), errors[0])
     # Where a name or a list of names is expected, the path says which was tried.
-    parts = [str(part) for part in first["loc"] if not str(part).startswith(_TRIED)]
+    *parents, last = map(str, first["loc"]) if first["loc"] else [""]
+    parts = [part for part in parents if not _TRIED.fullmatch(part)]
+    if first["type"] == "unexpected_keyword_argument" or not _TRIED.fullmatch(last):
+        parts.append(last)
     field = shown(".".join(parts), 200)[1:-1]
     message = _SAID_BETTER.get(first["type"], first["msg"].removeprefix("Value error, "))
     text = ": ".join(part for part in (field, message) if part)

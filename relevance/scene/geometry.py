@@ -117,7 +117,7 @@ def corners(box):
     return points
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")  # what is level with the eye is endlessly far aside
 def projected(points, eye, axes, focal):
     """Points (K, 3) as the camera has them, (K, 3): pixels right and down of the image's
     middle, and depth, m. Eye, axes and focal length as `pinhole` gives them."""

@@ -15,7 +15,7 @@ from relevance.scene.checks import SceneError, checked
 from relevance.scene.contacts import check_boxes, with_all_supports
 from relevance.scene.plans import Pose
 from relevance.scene.predicates import Goal
-from relevance.scene.projection import project, vertices
+from relevance.scene.projection import pinhole, vertices
 from relevance.scene.words import Id, normal, shown
 
 MOST_BOXES = 254
@@ -106,7 +106,8 @@ def _check_camera(camera: Camera, objects: tuple[Box, ...]) -> None:
     """Raise SceneError when near and far cut off all that is in front of the camera."""
     if camera == _DEFAULT_CAMERA:
         return
-    _, depth = project(camera, np.concatenate([vertices(box) for box in objects]))
+    eye, axes, _ = pinhole(camera)
+    depth = (np.concatenate([vertices(box) for box in objects]) - eye) @ axes[:, 2]
     ahead = depth[depth > 0]
     if len(ahead) and not ((ahead > camera.near) & (ahead < camera.far)).any():
         raise SceneError(

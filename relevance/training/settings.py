@@ -33,7 +33,7 @@ class TrainConfig:
         default_factory=lambda: BODIES["glimpse"].config()
     )
     """The body and its settings."""
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Of the weights, the order of scenes and the augmentation."""
     steps: Count = 1000
     """Optimiser steps."""

@@ -235,7 +235,7 @@ def _saved(*axes: Axes, found: Curves) -> None:
         shown += [row[end] for row in rows for end in ("saved_free_low", "saved_free_high")]
         shown = [value for value in shown if math.isfinite(value)]  # some beta may solve nothing
         ax.set_ylim(min(shown) - 0.02, max(shown) + 0.02)
-        if max(paid) < ax.get_ylim()[0]:
+        if paid and max(paid) < ax.get_ylim()[0]:
             text = f"the look paid: below, at {_ends(paid)}"
             ax.text(0.98, 0.93, text, transform=ax.transAxes, ha="right", color=MUTED, fontsize=8)
     axes[0].figure.legend(
