@@ -29,6 +29,23 @@ def test_every_solved_plan_replays_and_reaches_its_goal(planned):
         assert goal_holds(scene.moved(result.final), goal, scene.robot)
 
 
+@pytest.mark.parametrize("search", ["tree", "informed"])
+def test_a_search_ends_where_nothing_more_can_leave(search):
+    """Too wide for the hand, and on all sides of the subject, however many actions there may be."""
+    sides = ((0.0, 0.09, 0.08), (0.0, -0.09, 0.08), (0.101, 0.0, 0.12), (-0.101, 0.0, 0.12))
+    plates = (
+        Box(name=f"w{i}", size=(wide, 0.12, 0.1), position=(x, y, 0.05), color=GREY)
+        for i, (x, y, wide) in enumerate(sides)
+    )
+    scene = Scene(objects=(box("a", 0.0, 0.0, RED), box("r", 0.0, 0.35, BLUE), *plates))
+    few, many = (
+        plan(scene, "on(a, r)", config=PlannerConfig(search=search, max_actions=most))
+        for most in (6, 10**12)
+    )
+    assert (few.status, few.counts) == (many.status, many.counts)
+    assert many.status == "infeasible"
+
+
 @pytest.mark.parametrize("at", [(-0.25, -0.12), (-0.25, 0.08), (-0.2, 0.12), (-0.15, -0.08)])
 def test_the_elbow_is_turned_aside_from_a_pole(at):
     pole = Box(name="pole", size=(0.05, 0.05, 0.5), position=(*at, 0.25), color=GREY)

@@ -69,6 +69,8 @@ class Levels(Attempt):
             if found:
                 return found
             frontier = following
+            if not frontier:
+                break
         self.cut |= bool(frontier)
         return []
 
@@ -116,6 +118,8 @@ class Levels(Attempt):
                     others |= {chosen | {name} for name in rank.keys() - chosen if leaves(name)}
             frontier = sorted(following, key=partial(_ranks, rank))
             rest = sorted(others - following, key=partial(_ranks, rank))
+            if not (frontier or rest):
+                break
         self.cut |= bool(frontier or rest)
         return []
 
