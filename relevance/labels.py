@@ -153,7 +153,7 @@ def scene_row(
 
 
 def stored_scene(row: Mapping[str, Any], *, where: str = "scenes") -> Scene:
-    """The scene of a row; raises SceneError when it is impossible or is not what its id says."""
+    """The scene of a row; raises SceneError when it is impossible."""
     boxes = [
         {key: value for key, value in box.items() if not key.startswith("visible_")}
         for box in row["objects"]

@@ -209,7 +209,7 @@ def mean_interval(values: Iterable[float], *, confidence: float = CONFIDENCE) ->
     return bootstrap((sample,), lambda a, axis: a.mean(axis=axis), confidence=confidence)
 
 
-def binomial_interval(hits: int, n: int, *, confidence: float = 0.95) -> Interval:
+def binomial_interval(hits: int, n: int, *, confidence: float) -> Interval:
     """A share with its exact (Clopper-Pearson) interval; nan of nothing."""
     from scipy.stats import binomtest  # half a second to import
 

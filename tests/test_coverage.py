@@ -163,12 +163,12 @@ def test_every_family_that_asks_a_predicate_is_promised() -> None:
 
 
 def test_exact_intervals() -> None:
-    none, all_ = binomial_interval(0, 10), binomial_interval(10, 10)
+    none, all_ = (binomial_interval(hits, 10, confidence=0.95) for hits in (0, 10))
     assert (none.value, none.low, none.n) == (0, 0, 10)
     assert none.high == pytest.approx(1 - 0.025 ** (1 / 10))
     assert (all_.value, all_.high) == (1, 1)
     assert all_.low == pytest.approx(0.025 ** (1 / 10))
-    assert math.isnan(binomial_interval(0, 0).value)
+    assert math.isnan(binomial_interval(0, 0, confidence=0.95).value)
 
 
 def test_covered_by_hand_and_a_breach_is_seen() -> None:

@@ -21,7 +21,7 @@ def _merge(_: Preset) -> Callable[..., int]:
         """Make a dataset of others by reference: no file is copied, every command works on it.
 
         Args:
-            datasets: The datasets; equal schemas, no scene in common.
+            datasets: The datasets; labelled alike, no scene in common.
             into: Folder of the new one.
         """
         from relevance.pipeline import merge, shards_of

@@ -27,13 +27,10 @@ from relevance.evaluation.comparisons import Comparison, summarise
 from relevance.evaluation.predictions import Progress, predict
 from relevance.evaluation.reruns import EvaluationConfig, choose_tasks, compare, limits
 from relevance.evaluation.scorer import load_scorer, open_checkpoint
-from relevance.metrics import Interval, binomial_interval, mean
+from relevance.metrics import WIDE, Interval, binomial_interval, mean
 from relevance.networks import named, read_checkpoint, write_checkpoint
 from relevance.scene import FAMILIES, PREDICATES
 from relevance.store import Dataset
-
-CONFIDENCE = 0.95
-"""Of the intervals of coverages."""
 
 
 def calibrate(
@@ -207,7 +204,7 @@ def _covered(group: str, level: float, rows: Predictions, beta: np.ndarray) -> C
         group=group,
         coverage=level,
         beta=mean(beta[first]),
-        reached=binomial_interval(int(hits.sum()), len(hits), confidence=CONFIDENCE),
+        reached=binomial_interval(int(hits.sum()), len(hits), confidence=WIDE),
         reached_all=float(np.average(whole, weights=1 / goals[scene])),
         goals=len(first),
         objects=mean(rows.n_objects[first]),

@@ -21,8 +21,7 @@ def merge(sources: Sequence[str | Path], into: str | Path) -> Dataset:
     works on it. Labels that a source gets later, under another policy say, are seen here too;
     shards that it gets later are not. Validation shards whose scenes one of the sources was mined
     from are left out: copies of them are trained on. Raises DatasetError for less than two
-    sources, tables of different versions, labels made in different ways, or a scene that is there
-    twice.
+    sources, labels made in different ways, or a scene that is there twice.
     """
     target = absolute(into)
     datasets = [_flat(path) for path in sources]
@@ -91,7 +90,7 @@ def _way(target: Path, source: Path) -> str:
 
 
 def _same(head: Dataset, other: Dataset) -> None:
-    """Raises DatasetError unless two datasets have equal schemas and ways of labelling."""
+    """Raises DatasetError unless two datasets have equal layouts and ways of labelling."""
     for key in ("layout", "planner_version"):
         found, expected = other.description.get(key), head.description.get(key)
         if found != expected:

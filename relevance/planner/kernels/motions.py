@@ -335,7 +335,7 @@ def motion(X, arm, leave, leaving, arrive, bodies, obstacles) -> tuple[float, fl
 
     leave / arrive: hand targets of the two switches; without `leaving` the motion starts
     free. Returns the worst penetration (m; -1 where no motion was found that keeps the dense
-    check within ALLOWED), the cost (rad^2) and the time between rows (s).
+    check well within ALLOWED), the cost (rad^2) and the time between rows (s).
     """
     shape = (len(bodies.link), len(obstacles))
     first, last = np.zeros(shape), np.zeros(shape)

@@ -347,5 +347,5 @@ def _solved(
 
 
 def _acceleration(q: np.ndarray) -> float:
-    """Squared second differences at rest before and after, as in PlanResult.cost, rad^2."""
+    """Squared second differences at rest before and after, rad^2."""
     return float((np.diff(np.vstack([q[:1], q, q[-1:]]), n=2, axis=0) ** 2).sum())
