@@ -49,6 +49,12 @@ def at_least(flag: str, value: float | None, least: float, most: float = math.in
         raise UsageError(f"{flag} {value}: expected {expected}")
 
 
+def over_zero(flag: str, value: float | None) -> None:
+    """UsageError that names the flag, unless it is not given, or a finite number over 0."""
+    if value is not None and not 0 < value < math.inf:
+        raise UsageError(f"{flag} {value}: expected a number over 0")
+
+
 def check_workers(workers: int) -> None:
     """UsageError unless that many processes can be had."""
     at_least("--workers", workers, 1, MOST_WORKERS)

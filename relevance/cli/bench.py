@@ -8,7 +8,6 @@ import csv
 import dataclasses
 import functools
 import itertools
-import math
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from relevance.cli.arguments import OptionalName, settings_of
+from relevance.cli.arguments import OptionalName, over_zero, settings_of
 from relevance.cli.terminal import UsageError, bar, say, show, to_json
 
 Part = Literal["speed", "truth", "stability", "searches", "scaling", "completeness"]
@@ -78,7 +77,7 @@ def bench_planner(_: Any) -> Callable[..., int]:
         _require("--seed", seed, seed is None or 0 <= seed < 2**63, "0 to 2**63 - 1")
         _require("--unsolved", unsolved, unsolved >= 0, "at least 0")
         _require("--unsolved", unsolved, not unsolved or against is not None, "--against as well")
-        _require("--limit", limit, 0 < limit < math.inf, "a number over 0")
+        over_zero("--limit", limit)
         seed = secrets.randbits(32) if seed is None else seed
         if against:
             from relevance.planner import PLANNERS

@@ -1,7 +1,6 @@
 """The subcommands `bench planner`, `guides`, `dataset`, `training` and `sight`."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
-import math
 import os
 import secrets
 import tempfile
@@ -13,9 +12,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from relevance.cli.arguments import Command, Preset, at_least, one_of, settings_of
+from relevance.cli.arguments import Command, Preset, at_least, one_of, over_zero, settings_of
 from relevance.cli.bench import bench_planner, hand_over, write, write_scenes
-from relevance.cli.terminal import UsageError, bar, say
+from relevance.cli.terminal import bar, say
 
 Part = Literal["making", "reading", "queries", "crashes"]
 PARTS: tuple[Part, ...] = ("making", "reading", "queries", "crashes")
@@ -81,8 +80,7 @@ def _guides(_: Preset) -> Callable[..., int]:
         at_least("--seed", seed, 0, 2**31)
         for size in sizes:
             at_least("--sizes", size, 3)
-        if not 0 < seconds < math.inf:
-            raise UsageError(f"--seconds {seconds}: expected a number over 0")
+        over_zero("--seconds", seconds)
         PLANNERS[planner].require()
         seed = secrets.randbits(31) if seed is None else seed
         folder = out or Path("data/bench") / f"guides-{seed}"

@@ -1,17 +1,24 @@
 """The subcommand `study`: many networks trained and judged, in one table."""
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from relevance.cli.arguments import Command, DatasetArg, OptionalCount, Preset, Workers, at_least
+from relevance.cli.arguments import (
+    Command,
+    DatasetArg,
+    OptionalCount,
+    Preset,
+    Workers,
+    at_least,
+    over_zero,
+)
 from relevance.cli.bench import hand_over
 from relevance.cli.processes import pools
-from relevance.cli.terminal import UsageError, bar, say
+from relevance.cli.terminal import bar, say
 
 StudyArg = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STUDY")]
 Words = Annotated[tuple[str, ...], tyro.conf.arg(metavar="WORD")]
@@ -59,8 +66,7 @@ def _study(_: Preset) -> Callable[..., int]:
         from relevance.store import replacing
         from relevance.training import Plan, TrainConfig, find_checkpoint, run_study, ship
 
-        if minutes is not None and not 0 < minutes < math.inf:
-            raise UsageError(f"--minutes {minutes}: expected a number over 0")
+        over_zero("--minutes", minutes)
         at_least("--goals", goals, 0)
         more = {"only": only, "device": device, "folder": out}
         plan = Plan.of(dataset, study, minutes=minutes, goals=goals, **more)
