@@ -43,7 +43,7 @@ WITH both_labelled AS (
 SELECT
     b.* EXCLUDE (plan_before, plan_now, because_before, because_now),
     CASE
-        WHEN b.plan_before = b.plan_now THEN
+        WHEN b.policy_before <> b.policy_now AND list_sort(o.moved) = list_sort(n.moved) THEN
             b.policy_before || ': ' || coalesce(
                 b.because_before,
                 CASE WHEN b.relevant_before THEN 'the plan moves it' ELSE 'the plan does without it' END
@@ -57,6 +57,8 @@ SELECT
             || CASE WHEN o.n_actions <> n.n_actions
                 THEN ' (' || n.n_actions || ' actions instead of ' || o.n_actions || ')' ELSE '' END
             || CASE WHEN o.ambiguous OR n.ambiguous THEN ' (ambiguous)' ELSE '' END
+            || CASE WHEN b.policy_before <> b.policy_now
+                THEN '; ' || b.policy_now || ' instead of ' || b.policy_before ELSE '' END
     END AS why
 FROM both_labelled AS b
 JOIN all_plans AS o ON o.plan_id = b.plan_before
@@ -84,7 +86,7 @@ FROM labels AS n
 JOIN beside_plans AS o USING (scene_id, split, predicate, subject, reference)
 WHERE NOT o.holds;
 
--- What planning anew changed, a row a family and an older labelling: goals of both by what became
+-- What planning anew changed, a row a family and older settings: goals of both by what became
 -- of their plans, and queries of both by what became of their labels (of the same policy). All
 -- that is moved counts, subject included.
 CREATE OR REPLACE VIEW replanned AS
@@ -134,7 +136,7 @@ by_query AS (
     GROUP BY ALL
 )
 SELECT
-    g.family, g.planner_before, g.planner_now, goals, newly_solved, no_longer_solved, never_solved,
+    g.family, g.planner_before, g.planner_now, g.config_before, goals, newly_solved, no_longer_solved, never_solved,
     same_boxes_moved, fewer_boxes_moved, more_boxes_moved, other_boxes_moved,
     coalesce(queries, 0) AS queries, coalesce(equal, 0) AS equal,
     coalesce(to_irrelevant, 0) AS to_irrelevant, coalesce(to_relevant, 0) AS to_relevant

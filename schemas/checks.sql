@@ -114,7 +114,9 @@ SELECT l.file, l.row, 'relevant',
     l.query || ': expected ' || list_contains(p.moved, l.query)
     || ' as the plan says, found ' || l.relevant
 FROM labels AS l JOIN plans AS p USING (plan_id)
-WHERE l.policy = 'found' AND l.relevant <> list_contains(p.moved, l.query)
+WHERE l.relevant <> list_contains(p.moved, l.query)
+    -- other policies may call relevant what this plan does without, or irrelevant what it moves
+    AND l.policy IN ('found', CASE WHEN l.relevant THEN 'necessary' ELSE 'any-minimal' END)
 UNION ALL
 SELECT l.file, l.row, 'subject', 'expected goal, scene and flags of the plan, found others'
 FROM labels AS l JOIN plans AS p USING (plan_id)
@@ -139,8 +141,8 @@ WHERE l.policy IN ('found', 'necessary') AND l.relevant AND NOT list_contains(p.
 
 -- rule: a labelled plan has one label for each object
 SELECT l.file, l.row, 'query' AS "column",
-    'expected ' || s.n_objects || ' different objects for plan ' || l.plan_id
-    || ', found ' || l.found AS message
+    'expected ' || s.n_objects || ' labels of as many objects for plan ' || l.plan_id
+    || ', found ' || l.labels || ' of ' || l.found AS message
 FROM (
     SELECT min(file) AS file, min(row) AS row, plan_id, scene_id,
         count(*) AS labels, count(DISTINCT query) AS found

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import CONFIG, small_dataset
 
-from relevance.pipeline import prepare
+from relevance.pipeline import beyond_repair, missing, prepare
 from relevance.pipeline.checking import Breach, check, rules
 from relevance.report.card import write_card
 from relevance.report.tables import statistics
@@ -162,6 +162,25 @@ def test_a_file_that_is_not_listed(dataset: Dataset) -> None:
     assert all("expected a shard that dataset.json lists" in b.message for b in breaches)
 
 
+def test_copies_of_files_are_named_and_not_read(dataset: Dataset) -> None:
+    rows = len(dataset.read_rows("labels"))
+    labels, scenes = dataset.path / LABELS_FILE, dataset.path / SCENES_FILE
+    shutil.copy(scenes, scenes.with_name("shard-000000 (1).parquet"))
+    shutil.copy(labels, dataset.path / "labels/copy.parquet")
+    shutil.copy(labels, dataset.path / "labels/shard-000000.parquet")
+    shutil.copytree(labels.parent, dataset.path / "labels/split=train")
+    assert len(dataset.read_rows("labels")) == rows
+    with dataset.connect() as connection:
+        assert connection.execute("SELECT count(*) FROM labels").fetchone() == (rows,)
+    breaches = found(dataset)
+    assert all("expected the name of a shard" in breach.message for breach in breaches)
+    names = [breach.file for breach in breaches]
+    assert {name.split("/")[0] for name in names} == {"scenes", "labels"}
+    assert len(names) == 3 + len(list(labels.parent.parent.rglob("split=train/*.parquet")))
+    assert set(beyond_repair(dataset.path, names)) == {*names}
+    assert [work.jobs for work in missing(dataset.path, names)] == [(), ()]
+
+
 def test_a_broken_description(dataset: Dataset) -> None:
     dataset.describe({**dataset.description, "config": {"seed": "x"}})
     assert [(b.file, b.message[:11]) for b in found(dataset)] == [("dataset.json", "config.seed")]
@@ -178,6 +197,12 @@ def _flip(rows: list[dict]) -> None:
     rows[0]["relevant"] = not rows[0]["relevant"]
 
 
+def _necessary(rows: list[dict]) -> None:
+    for row in rows:
+        row.update(policy="necessary")
+    next(row for row in rows if not row["relevant"])["relevant"] = True
+
+
 def _move(rows: list[dict]) -> None:
     row = first_held(rows)
     subject = next(pose for pose in row["final"] if pose["name"] == row["subject"])
@@ -186,6 +211,7 @@ def _move(rows: list[dict]) -> None:
 
 CHANGES: dict[str, tuple[str, str, str, Callable[[list[dict]], object]]] = {
     "label flipped": ("labels", LABELS_FILE, "relevant", _flip),
+    "necessary and not moved": ("labels", LABELS_FILE, "relevant", _necessary),
     "label missing": ("labels", LABELS_FILE, "query", lambda rows: rows.pop()),
     "label twice": ("labels", LABELS_FILE, "query", lambda rows: rows.append(rows[0])),
     "label of nothing": (

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from ruled import ruled
 
-from relevance.pipeline import Balance, balances, balances_between
+from relevance.pipeline import Balance, balances, balances_between, shifting
 from relevance.store import Dataset, Labelling
 
 
@@ -37,7 +37,8 @@ def test_a_shift_is_more_than_three_points_and_more_than_noise() -> None:
     assert balance((900, 900), (0.10, 0.15), 0.01).shifted
     assert balance((900, 900), (0.15, 0.10), 0.01).shifted
     assert not balance((900, 900), (0.10, 0.12), 0.001).shifted, "less than 3 points"
-    assert not balance((9, 9), (0.10, 0.20), 0.05).shifted, "noise"
+    assert not balance((900, 900), (0.10, 0.20), 0.05).shifted, "noise"
+    assert not balance((900, 3), (0.10, 0.90), 0.0).shifted, "three that are alike"
     assert str(balance((900, 30), (0.1, 0.15), 0.01)) == (
         "on: 15.0% of the queries in 30 new scenes are relevant, 10.0% in 900 before (+5.0 points)"
     )
@@ -60,7 +61,10 @@ def test_new_files_are_held_against_all_others(dataset: Dataset) -> None:
     assert balances(dataset, []) == []
 
 
-def test_labels_that_were_made_otherwise_shift(dataset: Dataset) -> None:
+def test_labels_that_were_made_otherwise_shift(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shifting, "FEWEST", 2)
     new = files(dataset, "behind", "train")[0]
     file = {"predicate": "behind", "split": new[0], "shard": new[1]}
     [before] = [b for b in balances(dataset, [("behind", *new)]) if b.predicate == "behind"]
@@ -69,6 +73,36 @@ def test_labels_that_were_made_otherwise_shift(dataset: Dataset) -> None:
     assert after.shares == (before.shares[0], 0.0)
     assert after.shifted
     assert after.error <= before.error, "no scene of the new ones differs from another"
+
+
+def test_the_error_is_that_of_scenes_drawn_again(dataset: Dataset) -> None:
+    new = [("on", "train", shard) for _, shard in files(dataset, "on", "train")][:1]
+    [found] = [b for b in balances(dataset, new) if b.predicate == "on"]
+    rows = [row for row in dataset.read_rows("labels") if not row["is_goal_object"]]
+    scenes: dict[tuple[bool, str], list[bool]] = {}
+    for row in rows:
+        if row["predicate"] == "on":
+            side = (row["split"], row["shard"]) == new[0][1:]
+            scenes.setdefault((side, row["scene_id"]), []).append(row["relevant"])
+    drawn, squared = np.random.default_rng(0), 0.0
+    for side in (False, True):
+        sums = np.array([(sum(r), len(r)) for (of, _), r in scenes.items() if of is side])
+        again = sums[drawn.integers(len(sums), size=(4000, len(sums)))].sum(1)
+        squared += np.var(again[:, 0] / again[:, 1])
+    assert found.error == pytest.approx(np.sqrt(squared), rel=0.15)
+
+
+def test_one_scene_is_no_shift(dataset: Dataset) -> None:
+    split, shard = files(dataset, "behind", "train")[0]
+    file = {"predicate": "behind", "split": split, "shard": shard}
+    first = dataset.read_rows("labels", **file)[0]["scene_id"]
+    rows = [row for row in dataset.read_rows("labels", **file) if row["scene_id"] == first]
+    dataset.write_rows("labels", [{**row, "relevant": False} for row in rows], **file)
+    [found] = [b for b in balances(dataset, [("behind", split, shard)]) if b.predicate == "behind"]
+    assert found.shares == (1.0, 0.0)
+    assert found.scenes[1] == 1
+    assert abs(found.change) > 3 * found.error, "by its formula alone it would be a shift"
+    assert not found.shifted
 
 
 def test_new_plans_are_held_against_old_ones_of_their_scenes(dataset: Dataset) -> None:

@@ -89,6 +89,43 @@ def test_another_policy_lies_beside(made: Path, policy: str) -> None:
     assert kept == before
 
 
+@pytest.mark.parametrize(
+    ("moved", "policy", "why"),
+    [
+        (["b"], "found", "the plan moves a, b instead of b"),
+        (["b"], "any-minimal", "the plan moves a, b instead of b; found instead of any-minimal"),
+        (["b", "a"], "any-minimal", "any-minimal: not a; found: the plan moves it"),
+    ],
+)
+def test_changes_say_what_is_otherwise(moved: list[str], policy: str, why: str) -> None:
+    """Of the plan, of the policy, or of both."""
+    with duckdb.connect() as plain:
+        for name, plan_id, boxes in (("plans", "n", ["a", "b"]), ("beside_plans", "o", moved)):
+            plain.execute(
+                f"""create table {name} as select $1 as plan_id, $2 as moved, 's' as scene_id,
+                'test' as split, 0 as shard, 'on' as predicate, 'b' as subject, 'c' as reference,
+                4 as n_actions, false as ambiguous, true as holds, '' as reason,
+                '' as replay_reason, 'solved' as status, '1' as planner_version, $1 as config_hash
+                """,
+                [plan_id, boxes],
+            )
+        for name, plan_id, of, said in (
+            ("labels", "n", "found", None),
+            ("beside_labels", "o", policy, None if policy == "found" else "not a"),
+        ):
+            plain.execute(
+                f"""create table {name} as select plan_id, scene_id, split, shard, predicate,
+                subject, reference, 'a' as query, false as is_goal_object, planner_version,
+                config_hash, $2 as policy, plan_id = 'n' as relevant, $3::varchar as because
+                from (from plans union all from beside_plans) where plan_id = $1
+                """,
+                [plan_id, of, said],
+            )
+        plain.execute("create table shard_families (split text, shard int, family text)")
+        plain.execute((SCHEMAS / "changes.sql").read_text())
+        assert plain.sql("select why from label_changes").fetchall() == [(why,)]
+
+
 def test_necessary_is_what_the_planner_cannot_do_without() -> None:
     dataset = Dataset.open(grown_dataset())
     scenes = {row["scene_id"]: row for row in dataset.read_rows("scenes")}
@@ -150,6 +187,9 @@ def test_other_plans_take_the_place_and_the_old_ones_lie_beside(made: Path) -> N
         made, "select relevant_before, relevant_now, policy_now, why from label_changes"
     )
     assert changes, "a plan of two actions moves no blocker"
+    for _, now, policy, why in changes:
+        assert policy in (None, "found"), why
+        assert now is None or "; " not in why, "both are of the same policy"
     gone = [why for _, now, _, why in changes if now is None]
     assert gone
     assert all(why.startswith("no plan that holds now: ") for why in gone)
@@ -500,12 +540,23 @@ def test_estimate_command_before_and_after(
     assert rows["scenes"]["estimate"] == 20
     assert rows["hours"]["estimate"] > 0
     assert [file.name for file in new.iterdir()] == ["estimate.json"]
-    shutil.copy(new / "estimate.json", made)
-    assert main(["estimate", str(made), "--format", "json"]) == 0
+    shutil.copy(new / "estimate.json", made)  # of other settings: it is measured anew
+    there = ["estimate", str(made), "--sample", "4", "--workers", "1", "--format", "json"]
+    assert main(there) == 0
     rows = {row["quantity"]: row for row in json.loads(capfd.readouterr().out)}
     assert rows["scenes"]["actual"] == 8
-    assert rows["scenes"]["actual / estimate"] == pytest.approx(8 / 20)
+    assert rows["scenes"]["actual / estimate"] == 1
+    kept = (made / "estimate.json").read_text()
+    assert main(there) == 0
+    assert (made / "estimate.json").read_text() == kept
     assert check(made, render=False) == []
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"queries": []}', '{"queries": [{"x": 1}]}'])
+def test_a_broken_estimate_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "estimate.json").write_text(text)
+    with pytest.raises(DatasetError, match=r"estimate\.json: expected an estimate .* delete it"):
+        Estimate.read(tmp_path)
 
 
 def test_plain_duckdb_sees_what_changed(made: Path) -> None:

@@ -4,12 +4,13 @@
 -- first), skip and rows.
 WITH
 judged_wrongly AS (
-    SELECT scene_id, predicate, subject, reference, count(*) AS wrong
-    FROM predictions
-    WHERE checkpoint_id = getvariable('checkpoint_id')
-        AND split = coalesce(getvariable('split'), 'test')
-        AND NOT is_goal_object
-        AND (score > -coalesce(getvariable('beta'), 0)) <> relevant
+    SELECT p.scene_id, p.predicate, p.subject, p.reference, count(*) AS wrong
+    FROM predictions AS p
+    JOIN labels AS l USING (split, scene_id, predicate, subject, reference, query)
+    WHERE p.checkpoint_id = getvariable('checkpoint_id')
+        AND p.split = coalesce(getvariable('split'), 'test')
+        AND NOT l.is_goal_object
+        AND (p.score > -coalesce(getvariable('beta'), 0)) <> l.relevant
     GROUP BY ALL
 ),
 sized AS (

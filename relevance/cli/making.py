@@ -58,7 +58,8 @@ def _estimate(preset: DatasetPreset) -> Callable[..., int]:
 
         Makes a sample of scenes and plans on this machine, says what the whole comes to, and
         keeps that in DATASET/estimate.json. For a dataset that is there, prints what it holds
-        and took beside what was estimated, or measures now if nothing was.
+        and took beside what was estimated, or measures now if that was nothing or of other
+        settings.
 
         Args:
             dataset: Folder of the dataset, there or to be made.
@@ -72,7 +73,7 @@ def _estimate(preset: DatasetPreset) -> Callable[..., int]:
         there = (locate(dataset) / "dataset.json").is_file()
         wanted = load_config(Dataset.open(dataset)) if there else config
         found = Estimate.read(dataset)
-        if found is None or (not there and found.config_hash != wanted.content_hash):
+        if found is None or found.config_hash != wanted.content_hash:
 
             def run(jobs: Sequence[Job]) -> list[Any]:
                 units = {

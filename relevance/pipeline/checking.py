@@ -45,6 +45,8 @@ PER_RULE = 20
 IN_MEMORY = 100_000_000
 """Bytes of Parquet up to which `check` copies the tables before it queries them."""
 
+_STRAY = "expected the name of a shard, found another; nothing reads it: move or delete it"
+
 Progress = Callable[[int, int], None]
 
 
@@ -86,6 +88,7 @@ def check(
     breaches += [Breach(file=file, message=message) for file, message in found]
     files = [file for table in TABLES for file in dataset.files(table)]
     files += dataset.files_beside()
+    breaches += [Breach(file=_name(dataset, file), message=_STRAY) for file in dataset.strays()]
     unreadable: set[Path] = set()
     odd: set[Path] = set()
     for done, file in enumerate(files, 1):

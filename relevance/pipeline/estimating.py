@@ -102,13 +102,22 @@ class Estimate:
 
     @classmethod
     def read(cls, root: str | Path) -> Estimate | None:
-        """The estimate that was kept with a dataset; None when there is none."""
+        """The estimate that was kept with a dataset; None when there is none.
+
+        Raises DatasetError for a file that says something else.
+        """
         file = locate(root) / FILE
         if not file.is_file():
             return None
-        raw = json.loads(file.read_text())
-        queries = tuple(Queries(**row) for row in raw.get("queries", ()))
-        return cls(**{**raw, "quantities": Quantities(**raw["quantities"]), "queries": queries})
+        try:
+            raw = json.loads(file.read_text(encoding="utf-8"))
+            queries = tuple(Queries(**row) for row in raw["queries"])
+            return cls(**{**raw, "quantities": Quantities(**raw["quantities"]), "queries": queries})
+        except (ValueError, TypeError, LookupError) as error:
+            found = f"found something else ({type(error).__name__}: {error})"
+            raise DatasetError(
+                f"{file}: expected an estimate as `relevance estimate` keeps it, {found}; delete it"
+            ) from None
 
 
 def _one_by_one(jobs: Sequence[Job]) -> list[ShardReport]:

@@ -16,6 +16,8 @@ MOST = 0.03
 """A shift is larger than this: 3 points."""
 SURE = 3.0
 """And larger than this many standard errors, lest every handful of scenes be one."""
+FEWEST = 20
+"""Scenes on either side: of fewer, the standard error says nothing (of one, none differs)."""
 
 _SHARES = """
 scenes as (
@@ -24,7 +26,9 @@ scenes as (
     group by family, predicate, fresh, scene_id),
 shares as (
     select family, predicate, fresh, count(*) as n, sum(r) / sum(q) as share,
-        sqrt(sum(r * r) - 2 * share * sum(r * q) + share * share * sum(q * q)) / sum(q) as error
+        -- rounding may leave a sum of squares just below 0; of one scene there is no variance
+        greatest(sum(r * r) - 2 * share * sum(r * q) + share * share * sum(q * q), 0) as squares,
+        coalesce(sqrt(squares * n / nullif(n - 1, 0)), 0) / sum(q) as error
     from scenes group by family, predicate, fresh)
 select new.family, new.predicate, old.n, new.n, old.share, new.share,
     sqrt(old.error * old.error + new.error * new.error)
@@ -53,7 +57,8 @@ class Balance:
     @property
     def shifted(self) -> bool:
         """Whether that is more than 3 points, and more than noise."""
-        return abs(self.change) > max(MOST, SURE * self.error)
+        enough = min(self.scenes) >= FEWEST
+        return enough and abs(self.change) > max(MOST, SURE * self.error)
 
     def __str__(self) -> str:
         before, now = (f"{100 * share:.1f}%" for share in self.shares)

@@ -164,6 +164,7 @@ def broken(dataset: Dataset, named: Iterable[str]) -> tuple[dict[Key, set[str]],
     listed = {(spec.split, spec.shard): spec for spec in specs}
     drawn = dataset.description.get("hashes", {}).get("scenes") == config.scenes_hash
     planned = dataset.labelling == config.labelling
+    strays = {dataset.name_of(file) for file in dataset.strays()}
     for name in dict.fromkeys(named):
         parts = Path(name).parts
         top, keys = parts[0], dataset.file_keys(dataset.path / name)
@@ -171,7 +172,8 @@ def broken(dataset: Dataset, named: Iterable[str]) -> tuple[dict[Key, set[str]],
         table = parts[3] if top == "beside" and len(parts) > 3 else top
         if table == "compacted":
             continue  # gathered again from the labels
-        if table not in ("scenes", "images", "plans", "timings", "labels") or spec is None:
+        made = table in ("scenes", "images", "plans", "timings", "labels") and name not in strays
+        if not made or spec is None:
             left[name] = "nothing makes it anew"
             continue
         if table in ("scenes", "images"):

@@ -27,7 +27,7 @@ from relevance.store.paths import (
     replacing,
     sweep,
 )
-from relevance.store.tables import table_schema
+from relevance.store.tables import TABLES, table_schema
 
 SPLITS = ("train", "validation", "test")
 
@@ -223,15 +223,33 @@ class Files:
     def files(self, table: str, *, of: Labelling | None = None, **where: Any) -> list[Path]:
         """Files of a table in order, only those whose path agrees with `where`.
 
-        `of` asks for plans, timings or labels beside the current ones.
+        `of` asks for plans, timings or labels beside the current ones. What is named otherwise,
+        see `strays`, belongs to no table.
         """
-        found = (self.path / labellings.folder(table, of)).rglob("*.parquet")
-        keep = [file for file in sorted(found) if not file.name.startswith(".")]
+        keep = [file for file in self._parquet(table, of) if self._is_named(table, of, file)]
         if table_schema(table).sharded:
             for source in self.sources:
                 mine = source.dataset.files(table, of=of)
                 keep += [file for file in mine if "shard" in self.file_keys(file)]
         return [file for file in keep if _agrees(self.file_keys(file), where)] if where else keep
+
+    def strays(self) -> list[Path]:
+        """Parquet files in the folders of the tables that have no shard's name, such as copies;
+        nothing reads them."""
+        places: list[tuple[str, Labelling | None]] = [(table, None) for table in TABLES]
+        places += [(t, of) for of in self.labellings() for t in labellings.beside_tables()]
+        return [
+            file
+            for table, of in places
+            for file in self._parquet(table, of)
+            if not (file.name.startswith(".") or self._is_named(table, of, file))
+        ]
+
+    def _parquet(self, table: str, of: Labelling | None) -> list[Path]:
+        return sorted((self.path / labellings.folder(table, of)).rglob("*.parquet"))
+
+    def _is_named(self, table: str, of: Labelling | None, file: Path) -> bool:
+        return labellings.is_named(table, of, file.relative_to(self.path))
 
     def shards(self, split: str) -> list[int]:
         """Numbers of the finished shards of a split, in order."""

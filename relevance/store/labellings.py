@@ -6,8 +6,10 @@ The current ones lie in the dataset's own folders; every other one lies beside t
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from relevance.store.paths import DatasetError, checked_name
@@ -60,6 +62,15 @@ def template(table: str, of: Labelling | None) -> str:
     for key, value in of.made_by.items():
         path = path.replace(f"{{{key}}}", value)
     return path
+
+
+def is_named(table: str, of: Labelling | None, within: Path) -> bool:
+    """Whether a file's way within a dataset is one that the table's template leads to."""
+    pattern = "".join(
+        r"\d{6,}" if part == "{shard:06d}" else "[^/.][^/]*" if part[:1] == "{" else re.escape(part)
+        for part in re.split(r"({[^}]*})", template(table, of))
+    )
+    return re.fullmatch(pattern, within.as_posix()) is not None
 
 
 def folder(table: str, of: Labelling | None) -> str:
