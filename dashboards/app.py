@@ -85,7 +85,7 @@ def main() -> None:
 def choose(dataset: Dataset, path: str, page: str) -> Choice:
     """The side bar of a page."""
     own = dataset.labelling.policy if dataset.labelling else None
-    given = Choice(path=path, version=version_of(path), own_policy=own, policy=own)
+    given = Choice(path=path, version=version_of(dataset), own_policy=own, policy=own)
     if page not in JUDGING:
         return given
     with st.sidebar:

@@ -6,7 +6,7 @@ also runs by itself, in plain DuckDB after `schemas/tables.sql` and `schemas/vie
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
@@ -18,11 +18,11 @@ import streamlit as st
 from relevance.store import (
     Dataset,
     DatasetError,
+    Files,
     Labelling,
     Sample,
     decode,
     is_remote,
-    locate,
     needs,
 )
 
@@ -111,13 +111,17 @@ _FOOTERS: dict[Path, tuple[int, int, dict[str, str]]] = {}
 """Size, time of change and footer of a file, as they were when it was read."""
 
 
-def version_of(path: str) -> tuple[int, int]:
-    """Changes whenever a table of the dataset does: number of files and newest change."""
-    root = locate(path)
-    if is_remote(root):
-        return sum(1 for _ in root.rglob("*.parquet")), 0
-    files = list(root.rglob("*.parquet"))
-    return len(files), max((file.stat().st_mtime_ns for file in files), default=0)
+def version_of(dataset: Files) -> tuple[int, int]:
+    """Changes whenever a table of the dataset does, or of one that it refers to: number of files
+    and newest change (of those of this machine)."""
+    changes = [0 if is_remote(file) else file.stat().st_mtime_ns for file in _tables(dataset)]
+    return len(changes), max(changes, default=0)
+
+
+def _tables(dataset: Files) -> Iterator[Path]:
+    yield from dataset.path.rglob("*.parquet")
+    for source in dataset.sources:
+        yield from _tables(source.dataset)
 
 
 def chosen() -> Choice:

@@ -17,7 +17,7 @@ from typing import Any
 from relevance.errors import RelevanceError
 
 USUAL = "http://127.0.0.1:4200/api"
-FLOWS = ("generate", "label", "check", "train", "evaluate", "retrain", "demo")
+FLOWS = ("generate", "label", "check", "train", "evaluate", "reproduce", "retrain")
 """Those of this project; a server may have others."""
 _SECONDS = 5.0
 
@@ -64,9 +64,10 @@ def flow_runs(url: str, *, limit: int = 100) -> list[FlowRun]:
     flows = _post(url, "/flows/filter", {"flows": {"name": {"any_": list(FLOWS)}}})
     names = {flow["id"]: flow["name"] for flow in flows}
     asked = {"sort": "EXPECTED_START_TIME_DESC", "limit": limit}
+    asked |= {"flows": {"id": {"any_": list(names)}}}
     asked |= {"flow_runs": {"state": {"type": {"not_any_": ["SCHEDULED"]}}}}
     runs = _post(url, "/flow_runs/filter", asked) if names else []
-    return [_run(url, run, names[run["flow_id"]]) for run in runs if run["flow_id"] in names]
+    return [_run(url, run, names[run["flow_id"]]) for run in runs]
 
 
 def artifacts(url: str, *, limit: int = 20) -> list[Artifact]:

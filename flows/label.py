@@ -74,12 +74,7 @@ def label(
             "tasks": tasks,
             "plans that hold": holds,
             "made now": now[predicate, split],
-            "core seconds": round(
-                sum(
-                    r.seconds for r in reports if (r.predicate, r.spec.split) == (predicate, split)
-                ),
-                1,
-            ),
+            "seconds of a worker": round(seconds[predicate, split], 1),
         }
         for predicate, split, tasks, holds in totals
         if predicate in (predicates or PREDICATES)

@@ -26,10 +26,11 @@ from flows.train import train, train_model
 from relevance.errors import RelevanceError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from relevance.evaluation import TrialConfig
-    from relevance.networks import Learned, Record
+    from relevance.networks import Event, Learned, Record
     from relevance.store import Dataset
     from relevance.training import TrainConfig
 
@@ -96,14 +97,14 @@ def retrain(
     if pending(there) is not None:
         say("retrain: %s is being planned anew; `relevance label` finishes it", root)
         return rest
-    if preset == "fitting":
-        count = sql(root, "select count(*) from scenes where split = 'train'")[1][0][0]
-        preset = fitting_preset(count)
-        say("retrain: preset %s fits %d training scenes", preset, count)
-    config = configured(TrainConfig, preset, overrides)
-    configured(EvaluationConfig, preset, evaluation)  # refused now, not after an hour of training
-    trying = configured(TrialConfig, preset, trial)
     try:
+        if preset == "fitting":
+            count = sql(root, "select count(*) from scenes where split = 'train'")[1][0][0]
+            preset = fitting_preset(count)
+            say("retrain: preset %s fits %d training scenes", preset, count)
+        config = configured(TrainConfig, preset, overrides)
+        configured(EvaluationConfig, preset, evaluation)  # now, not after an hour of training
+        trying = configured(TrialConfig, preset, trial)
         name = checkpoint_id(there, config)
         known = {row["checkpoint_id"] for row in there.read_rows("checkpoints")}
         seen = sql(root, "select distinct checkpoint_id from evaluations")[1]
@@ -113,10 +114,11 @@ def retrain(
         raise
     evaluated, record = {name for (name,) in seen}, read_record(there)
     done = name in known & evaluated and record.tried(name)
-    if not force and (done or not enough(record, learned, least_new)):
-        last = name if done else record.history[-1].checkpoint_id
+    like = tried_like(record, learned)
+    if not force and (done or not enough(like, learned, least_new)):
+        last = name if done else like[-1].checkpoint_id
         say("retrain: nothing, or too little, is new since %s", last)
-        return rest | {"checkpoint": last}
+        return rest | {"checkpoint": str(root / "checkpoints" / f"{last}.pt")}
     check(dataset=str(root), render=False)
     chosen = choose(root, config, record.champion, continued)
     checkpoint = train(dataset=str(root), preset=preset, overrides=(overrides or {}) | chosen.more)
@@ -209,15 +211,21 @@ def _learned(dataset: Dataset, config: TrainConfig) -> Learned:
     )
 
 
-def enough(record: Record, learned: Learned, least_new: float) -> bool:
-    """Whether that share of the labels is new since a checkpoint of these settings was tried.
-
-    Labels that were made otherwise are new, all of them.
-    """
-    before = [
-        event.learned.labels
+def tried_like(record: Record, learned: Learned) -> list[Event]:
+    """What became of checkpoints of equal settings and labels that were made alike, the oldest
+    first."""
+    return [
+        event
         for event in record.history
         if (event.learned.settings, event.learned.labelling)
         == (learned.settings, learned.labelling)
     ]
+
+
+def enough(like: Sequence[Event], learned: Learned, least_new: float) -> bool:
+    """Whether that share of the labels is new since one of these was tried (see `tried_like`).
+
+    Labels that were made otherwise are new, all of them.
+    """
+    before = [event.learned.labels for event in like]
     return not before or learned.labels - max(before) >= max(least_new * learned.labels, 1)

@@ -31,8 +31,7 @@ from prefect.settings import PREFECT_API_URL, get_current_settings, temporary_se
 from prefect.task_runners import ProcessPoolTaskRunner, TaskRunner, ThreadPoolTaskRunner
 
 from flows.telling import CHECK_FAILED, SHARD_FAILED, trouble
-from relevance.errors import RelevanceError
-from relevance.pipeline import do
+from relevance.pipeline import PlansRefused, do
 from relevance.workers import ShardsFailed, gather, prepare_worker
 
 if TYPE_CHECKING:
@@ -217,7 +216,7 @@ def failures_told(stage: str, dataset: Path) -> Iterator[Callable[[str], None]]:
     except Exception as error:
         if lines:
             trouble(dataset, SHARD_FAILED, str(error), _listed(lines), stage=stage, shards=lines)
-        elif isinstance(error, RelevanceError):  # its shards were made, and are refused
+        elif isinstance(error, PlansRefused):  # its shards were made
             trouble(dataset, CHECK_FAILED, str(error), stage=stage)
         raise
 

@@ -6,7 +6,7 @@ An object is kept iff its score > -beta (CONTRIBUTING, The words), everywhere.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -201,12 +201,6 @@ class Interval:
     def __format__(self, spec: str) -> str:
         """`12.3 (11.0 to 13.9)`, each number by `spec`."""
         return f"{self.value:{spec}} ({self.low:{spec}} to {self.high:{spec}})"
-
-
-def mean_interval(values: Iterable[float], *, confidence: float = CONFIDENCE) -> Interval:
-    """Mean with its bootstrap interval; same values, same interval."""
-    sample = np.asarray(list(values), dtype=float)
-    return bootstrap((sample,), lambda a, axis: a.mean(axis=axis), confidence=confidence)
 
 
 def binomial_interval(hits: int, n: int, *, confidence: float) -> Interval:

@@ -16,7 +16,7 @@ from relevance.evaluation import (
     summarise,
     with_oracle,
 )
-from relevance.metrics import mean_interval, over_groups, ratio_of_sums
+from relevance.metrics import bootstrap, over_groups, ratio_of_sums
 from relevance.report import page
 from relevance.store import Dataset
 
@@ -83,13 +83,14 @@ def test_intervals_cover_two_thirds() -> None:
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(120):
-        found = mean_interval(rng.normal(3.0, 1.0, size=40))
+        found = bootstrap((rng.normal(3.0, 1.0, size=40),), np.mean)
         hits += found.low <= 3.0 <= found.high
     assert 0.55 <= hits / 120 <= 0.79
     values = rng.exponential(size=25)
-    assert mean_interval(values) == mean_interval(values)
-    assert mean_interval([2.0]).low == mean_interval([2.0, 2.0]).high == 2.0
-    assert mean_interval([]).n == 0
+    assert bootstrap((values,), np.mean) == bootstrap((values,), np.mean)
+    assert bootstrap((np.array([2.0]),), np.mean).low == 2.0
+    assert bootstrap((np.array([2.0, 2.0]),), np.mean).high == 2.0
+    assert bootstrap((np.array([]),), np.mean).n == 0
 
 
 def test_a_ratio_is_of_sums_and_paired() -> None:
@@ -104,7 +105,7 @@ def test_goals_of_a_scene_are_drawn_together() -> None:
     each = rng.normal(size=60)
     values = np.repeat(each, 5)  # five goals that say the same
     scenes = np.repeat(np.arange(60), 5).tolist()
-    together, alone = over_groups(scenes, np.nanmean, values), mean_interval(values)
+    together, alone = over_groups(scenes, np.nanmean, values), bootstrap((values,), np.mean)
     assert together.value == pytest.approx(alone.value)
     assert together.n == 300
     width = (together.high - together.low) / (alone.high - alone.low)

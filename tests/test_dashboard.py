@@ -17,13 +17,15 @@ from typing import Any
 
 import duckdb
 import pytest
+import yaml
 from evaluated import DATA, evaluated, labelled
 from streamlit.testing.v1 import AppTest
 
 from dashboards.asking import SQL, Choice, ask, version_of
+from dashboards.prefect_api import FLOWS
 from relevance.evaluation import read_evaluations, read_predictions, settings, summarise
 from relevance.networks import crown, settle
-from relevance.pipeline import describe
+from relevance.pipeline import describe, merge
 from relevance.report.style import TIMES, percent
 from relevance.store import Dataset
 
@@ -57,7 +59,7 @@ def all_of(root: Path) -> Choice:
     """The whole of a dataset, with the labels of its own policy."""
     dataset = Dataset.open(root)
     policy = dataset.labelling.policy if dataset.labelling else None
-    return Choice(path=str(root), version=version_of(str(root)), own_policy=policy, policy=policy)
+    return Choice(path=str(root), version=version_of(dataset), own_policy=policy, policy=policy)
 
 
 # --- queries ----------------------------------------------------------------------------------
@@ -120,6 +122,16 @@ def test_a_changed_file_is_read_again(tmp_path) -> None:
     dataset.write_rows("plans", rows[1:], **keys, made_by={"config": "c", "planner": "p"})
     assert choice.dataset.metadata(file)["config"] == "c"
     assert ask(all_of(root), "goal_totals")[0]["goals"] == before - 1
+
+
+def test_a_changed_source_of_a_merged_dataset_is_read_again(tmp_path) -> None:
+    roots = [shutil.copytree(labelled(), tmp_path / name) for name in ("one", "two")]
+    shutil.rmtree(roots[1] / "scenes")  # no scene may be there twice
+    both = merge(roots, tmp_path / "both")
+    before = version_of(both)
+    assert before[0] == sum(version_of(Dataset.open(root))[0] for root in roots) > 0
+    next(roots[0].rglob("*.parquet")).touch()
+    assert version_of(both) > before
 
 
 def test_some_shards_of_each_family_stand_for_a_large_split() -> None:
@@ -396,10 +408,12 @@ def prefect(answers: dict[str, Any]) -> Iterator[str]:
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
-            self.rfile.read(int(self.headers["Content-Length"]))
+            asked = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+            of = asked.get("flows", {}).get("id", {}).get("any_")
+            found = [one for one in answers[self.path] if not of or one["flow_id"] in of]
             self.send_response(200)
             self.end_headers()
-            self.wfile.write(json.dumps(answers[self.path]).encode())
+            self.wfile.write(json.dumps(found).encode())
 
         def log_message(self, *_: Any) -> None:
             pass
@@ -410,6 +424,11 @@ def prefect(answers: dict[str, Any]) -> Iterator[str]:
             yield f"http://127.0.0.1:{server.server_port}/api"
         finally:
             server.shutdown()
+
+
+def test_runs_are_of_the_flows_that_are_deployed() -> None:
+    deployed = yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]
+    assert {one["name"] for one in deployed} == {*FLOWS}
 
 
 def test_runs_come_from_the_server(page, monkeypatch) -> None:

@@ -99,6 +99,9 @@ def test_open_without_a_dataset(tmp_path: Path) -> None:
     (tmp_path / "dataset.json").write_text("{broken")
     with pytest.raises(DatasetError, match=r"dataset.json: expected a JSON object"):
         Dataset.open(tmp_path)
+    (tmp_path / "dataset.json").write_text('{"layout": 99}')
+    with pytest.raises(DatasetError, match=r"dataset.json: layout: expected 1, found 99"):
+        Dataset.open(tmp_path)
 
 
 def test_create_twice(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -237,6 +238,9 @@ def test_mistakes_are_one_line(tmp_path, capsys, monkeypatch):
     assert "no planned goal of scene 'x'" in refused(root, "--scene", "x", *film)
     assert "no goal on(a, b), expected one like" in refused(root, "--goal", "on(a,b)", *film)
     assert "no dataset.json" in refused(tmp_path, *film)
+    made = shutil.ignore_patterns("plans", "labels", "timings")
+    bare = shutil.copytree(GOLDEN, tmp_path / "bare", ignore=made)
+    assert "no plans there, expected `relevance label` first" in refused(bare, *film)
     assert "a file that ends in .gif" in refused(file, "--gif", tmp_path / "plan.mp4")
     assert "is no folder" in refused(file, "--gif", tmp_path / "no" / "plan.gif")
     assert "expected one of none" in refused(file, "--guide", "x", *film)

@@ -59,7 +59,10 @@ def cut(file: Path) -> None:
 
 def test_each_family_has_its_count() -> None:
     assert [family.replace("-", "_") for family in FAMILIES] == list(Counts.__dataclass_fields__)
-    assert Counts.each(3) == Counts.by_family(dict.fromkeys(FAMILIES, 3))
+    every = dict.fromkeys(FAMILIES, 3)
+    assert Counts.total([Counts.by_family(every)] * 2) == Counts(
+        **{name: 6 for name in Counts.__dataclass_fields__}
+    )
     assert Counts.total([Counts(on=1), Counts(on=2, same_plane=1)]) == Counts(on=3, same_plane=1)
 
 
@@ -122,7 +125,12 @@ def test_settings_that_admit_no_scene_leave_nothing(
 
 def test_identities_name_what_differs_and_the_versions(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = (GROWN.scenes_hash, GROWN.plans_hash)
-    more = replace(GROWN, train=Counts.each(9), scenes_per_shard=7, policy="necessary")
+    more = replace(
+        GROWN,
+        train=Counts.by_family(dict.fromkeys(FAMILIES, 9)),
+        scenes_per_shard=7,
+        policy="necessary",
+    )
     assert (more.scenes_hash, more.plans_hash) == plain
     assert replace(GROWN, seed=6).scenes_hash != plain[0]
     # a seed of its own for the goals, equal to the other, is the same goal set

@@ -44,9 +44,13 @@ DRAWN = ("n_objects", "predicate", "stands", "visible")
 """Breakdowns that are drawn, in the order in which they fill the columns."""
 
 
-@st.cache_resource(show_spinner=False, max_entries=4)  # not copied: they are large
 def predicted(choice: Choice) -> tuple[Predictions, list[str]]:
     """A checkpoint's predictions on the split, and what to know of them."""
+    return _predicted(replace(choice, beta=0.0))  # the same ones at every beta
+
+
+@st.cache_resource(show_spinner=False, max_entries=4)  # not copied: they are large
+def _predicted(choice: Choice) -> tuple[Predictions, list[str]]:
     name = choice.checkpoint or ""
     found = read_predictions(choice.dataset, name, split=choice.split)
     return found, unjudged(choice.dataset, name, split=choice.split)

@@ -14,9 +14,7 @@ from dataclasses import dataclass, replace
 from statistics import median
 from typing import Any
 
-import numpy as np
-
-from relevance.metrics import Interval, bootstrap, ratio_of_sums
+from relevance.metrics import Interval, over_groups, ratio_of_sums
 
 _LEAST = 1e-6
 """Seconds; less is no time to take a logarithm of."""
@@ -39,6 +37,7 @@ class Run:
 class SweptTask:
     """A task that the unguided planner solves, with its guided runs and its queries' scores."""
 
+    scene_id: str
     n_objects: int
     unguided: float
     """CPU seconds."""
@@ -115,12 +114,11 @@ def working_point(tasks: Sequence[SweptTask], beta: float) -> WorkingPoint:
     runs = [task.at(beta) for task in tasks]
     return WorkingPoint(
         beta=beta,
-        speedup=bootstrap(
-            (
-                np.array([task.unguided for task in tasks]),
-                np.array([task.cost(beta) for task in tasks]),
-            ),
+        speedup=over_groups(
+            [task.scene_id for task in tasks],
             ratio_of_sums,
+            [task.unguided for task in tasks],
+            [task.cost(beta) for task in tasks],
         ),
         misses=sum(not run.solved for run in runs),
         n_tasks=len(tasks),
@@ -148,6 +146,7 @@ def _task(rows: Sequence[Mapping[str, Any]], scored: Mapping[str, Any]) -> Swept
         runs[kept] = Run(kept=kept, solved=mine[0]["solved_guided"], seconds=max(seconds, 0.0))
     queries = list(zip(scored["scores"], scored["relevant"], strict=True))
     return SweptTask(
+        scene_id=rows[0]["scene_id"],
         n_objects=n_objects,
         unguided=unguided,
         network=median(row["seconds_inference"] for row in rows),

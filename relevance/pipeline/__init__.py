@@ -8,7 +8,6 @@ from relevance.pipeline.mining import Mined, MiningConfig, minable, mine, mined_
 from relevance.pipeline.preparing import append, describe, pending, prepare
 from relevance.pipeline.scenes import ATTEMPTS, draw, generate_shard, generated
 from relevance.pipeline.settings import (
-    LAYOUT,
     Counts,
     DatasetConfig,
     ShardReport,
@@ -22,6 +21,7 @@ from relevance.pipeline.shifting import Balance, balances, balances_between
 from relevance.pipeline.upkeep import REFUSED_LEAST, REFUSED_SHARE, finish, integrity
 from relevance.pipeline.work import (
     Job,
+    PlansRefused,
     Work,
     beyond_repair,
     labels_work,
@@ -31,7 +31,6 @@ from relevance.pipeline.work import (
 
 __all__ = [
     "ATTEMPTS",
-    "LAYOUT",
     "REFUSED_LEAST",
     "REFUSED_SHARE",
     "Balance",
@@ -42,6 +41,7 @@ __all__ = [
     "Made",
     "Mined",
     "MiningConfig",
+    "PlansRefused",
     "Quantities",
     "ShardReport",
     "ShardSpec",

@@ -70,8 +70,6 @@ class Queries:
     scenes: int
     relevant: int
     irrelevant: int
-    sample: int
-    """Queries that it rests on."""
 
     @property
     def share(self) -> float:
@@ -209,7 +207,6 @@ def _queries(
                     scenes=scenes,
                     relevant=round(relevant * factor),
                     irrelevant=round((queries - relevant) * factor),
-                    sample=queries,
                 )
             )
     return tuple(made)

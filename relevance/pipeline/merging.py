@@ -11,7 +11,7 @@ from typing import Any
 from relevance.pipeline.mining import SPLIT, copied_shards, looked_at
 from relevance.pipeline.preparing import describe
 from relevance.pipeline.settings import ShardSpec, load_config, scenes_of, shards_of
-from relevance.store import SPLITS, Dataset, DatasetError, absolute, is_remote
+from relevance.store import SPLITS, Dataset, DatasetError, absolute, differences, is_remote
 
 
 def merge(sources: Sequence[str | Path], into: str | Path) -> Dataset:
@@ -20,7 +20,7 @@ def merge(sources: Sequence[str | Path], into: str | Path) -> Dataset:
     Its shards are numbered anew, one source after the other; every view, reader and trainer
     works on it. Labels that a source gets later, under another policy say, are seen here too;
     shards that it gets later are not. Validation shards whose scenes one of the sources was mined
-    from are left out: copies of them are trained on. Raises DatasetError for less than two
+    from are left out: copies of them are trained on. Raises DatasetError for fewer than two
     sources, labels made in different ways, or a scene that is there twice.
     """
     target = absolute(into)
@@ -90,17 +90,14 @@ def _way(target: Path, source: Path) -> str:
 
 
 def _same(head: Dataset, other: Dataset) -> None:
-    """Raises DatasetError unless two datasets have equal layouts and ways of labelling."""
-    for key in ("layout", "planner_version"):
-        found, expected = other.description.get(key), head.description.get(key)
-        if found != expected:
-            raise DatasetError(
-                f"{other.path}: {key}: expected {expected} as in {head.path}, found {found}"
-            )
-    found, expected = load_config(other).policy, load_config(head).policy
-    if found != expected:
+    """Raises DatasetError unless two datasets are labelled in the same way."""
+    mine, its = (
+        {"planner_version": d.description.get("planner_version"), "policy": load_config(d).policy}
+        for d in (head, other)
+    )
+    for key, found, expected in differences(its, mine):
         raise DatasetError(
-            f"{other.path}: policy: expected {expected} as in {head.path}, found {found}"
+            f"{other.path}: {key}: expected {expected} as in {head.path}, found {found}"
         )
 
 

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from relevance.pipeline.settings import (
-    LAYOUT,
     Counts,
     DatasetConfig,
     ShardSpec,
@@ -34,6 +33,7 @@ from relevance.pipeline.settings import (
 from relevance.planner import PLANNER_VERSION
 from relevance.scene import FAMILIES
 from relevance.store import (
+    LAYOUT,
     SPLITS,
     TABLES,
     Dataset,

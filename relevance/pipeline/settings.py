@@ -21,10 +21,6 @@ from relevance.scene import FAMILIES, Predicate, asked_of
 from relevance.simulation import RENDERER_VERSION
 from relevance.store import SPLITS, Dataset, DatasetError, Labelling
 
-LAYOUT = 1
-"""Version of dataset.json."""
-
-
 Natural = Annotated[int, Field(ge=0, lt=2**63)]
 Positive = Annotated[int, Field(ge=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -46,11 +42,6 @@ class Counts:
     def by_family(cls, counts: Mapping[str, int]) -> Counts:
         """Counts from the families' names."""
         return cls(**{_field(family): count for family, count in counts.items()})
-
-    @classmethod
-    def each(cls, count: int) -> Counts:
-        """That many scenes of every family."""
-        return cls.by_family(dict.fromkeys(FAMILIES, count))
 
     @classmethod
     def total(cls, parts: Iterable[Counts]) -> Counts:

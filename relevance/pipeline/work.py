@@ -67,6 +67,10 @@ class Job:
         )
 
 
+class PlansRefused(RelevanceError):
+    """The replay refuses more plans than chance allows."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Work:
     """What is missing of one stage of a dataset."""
@@ -82,14 +86,13 @@ class Work:
     """Shards that cannot be labelled yet, having no scenes."""
 
     def finish(self) -> None:
-        """Note which stages are complete; raises RelevanceError for what must not pass unseen.
+        """Note which stages are complete; raises PlansRefused for what must not pass unseen.
 
-        Called once the jobs have run; a second call changes nothing. What must not pass unseen:
-        more refused replays than chance allows.
+        Called once the jobs have run; a second call changes nothing.
         """
         finish(self.root)
         if self.stage == "label" and (problem := refused(Dataset.open(self.root))):
-            raise RelevanceError(f"{self.root}: {problem}")
+            raise PlansRefused(f"{self.root}: {problem}")
 
 
 def scenes_work(root: str | Path, config: DatasetConfig) -> Work:

@@ -7,7 +7,6 @@ example scenes drawn from the stored images.
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
@@ -31,7 +30,7 @@ from relevance.report.style import (
 )
 from relevance.report.tables import Statistics, Table, cell, statistics
 from relevance.scene import FAMILIES
-from relevance.store import Dataset, decode
+from relevance.store import Dataset, decode, replacing
 
 PAGE = "README.md"
 MADE_WITH = ("relevance", "numpy", "pybullet", "casadi", "numba", "pyarrow", "duckdb")
@@ -50,29 +49,32 @@ def write_card(root: str | Path, out: str | Path) -> Path:
     there is no dataset.
     """
     dataset, found, out = Dataset.open(root), statistics(root), Path(out)
-    out.mkdir(parents=True, exist_ok=True)
     pictures: dict[str, str] = {}
     for name, (title, draw) in _PICTURES.items():
         figure = draw(found)
         if figure is not None:
-            figure.savefig(out / f"{name}.png", dpi=_DPI, metadata={"Software": None})
+            _save(figure, out / f"{name}.png")
             pictures[name] = title
     for family in FAMILIES:
         drawn = _drawn(dataset, family)
         if drawn is not None:
-            drawn.savefig(out / f"scenes-{family}.png", dpi=_DPI, metadata={"Software": None})
+            _save(drawn, out / f"scenes-{family}.png")
             pictures[f"scenes-{family}"] = f"Random scenes of family {family}"
     examples = _examples(dataset)
     if examples is not None:
-        examples.savefig(out / "examples.png", dpi=_DPI, metadata={"Software": None})
+        _save(examples, out / "examples.png")
         pictures["examples"] = (
             "Example scenes: subject outlined in white, reference in black, relevant in pink"
         )
     page = out / PAGE
-    temporary = out / f".{PAGE}.{os.getpid()}.tmp"
-    temporary.write_text(card(found, dataset, pictures), encoding="utf-8")
-    temporary.replace(page)
+    with replacing(page) as temporary:
+        temporary.write_text(card(found, dataset, pictures), encoding="utf-8")
     return page
+
+
+def _save(figure: Figure, file: Path) -> None:
+    with replacing(file) as temporary:
+        figure.savefig(temporary, format="png", dpi=_DPI, metadata={"Software": None})
 
 
 def card(found: Statistics, dataset: Dataset, pictures: Mapping[str, str] = {}) -> str:

@@ -21,7 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from relevance.metrics import mean_interval
+from relevance.metrics import over_groups
 from relevance.report.paper import paper
 from relevance.report.style import (
     BAND,
@@ -318,7 +318,8 @@ def runtimes(*axes: Axes, comparisons: dict[str, list[Comparison]]) -> None:
 
 
 def by_objects(ax: Axes, rows: dict[str, list[dict[str, Any]]]) -> None:
-    """Mean CPU time by the number of objects, with intervals; `rows` per guide, solvable tasks."""
+    """Mean CPU time by the number of objects, with intervals over scenes; `rows` per guide,
+    solvable tasks."""
     from relevance.evaluation import guided_cost
 
     first = next(iter(rows.values()))
@@ -326,7 +327,10 @@ def by_objects(ax: Axes, rows: dict[str, list[dict[str, Any]]]) -> None:
     series |= {guide: (chosen, guided_cost) for guide, chosen in rows.items()}
     for name, (chosen, cost) in series.items():
         counts = sorted({row["n_objects"] for row in chosen})
-        means = [mean_interval(cost(r) for r in chosen if r["n_objects"] == n) for n in counts]
+        means = [
+            over_groups([row["scene_id"] for row in of], np.nanmean, [cost(row) for row in of])
+            for of in ([row for row in chosen if row["n_objects"] == n] for n in counts)
+        ]
         color = guide_style(name).color
         ax.plot(counts, [m.value for m in means], "o-", markersize=4, color=color, label=name)
         lows, highs = [m.low for m in means], [m.high for m in means]

@@ -72,9 +72,14 @@ def stored_task(dataset: Dataset, scene_id: str | None = None, goal: str | None 
         ).fetchall()
         of_it = "" if scene_id is None else f" of scene {scene_id!r}"
         if not rows:
-            known = connection.execute("select min(scene_id) from scenes").fetchone()
-            like = f"expected one of its scene ids, such as {known[0]}" if known else ""
-            raise DatasetError(f"{dataset.path}: no planned goal{of_it}, {like}")
+            known = connection.execute("select min(scene_id) from plans").fetchone()
+            if known is None or known[0] is None:
+                raise DatasetError(
+                    f"{dataset.path}: no plans there, expected `relevance label` first"
+                )
+            raise DatasetError(
+                f"{dataset.path}: no planned goal{of_it}, expected a scene id such as {known[0]}"
+            )
         chosen = [row for row in rows if asked is None or row[-1] == str(asked)]
         if not chosen:
             some = ", ".join(row[-1] for row in rows[:3])

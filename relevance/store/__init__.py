@@ -6,7 +6,7 @@ The only importer of pyarrow, duckdb and webdataset.
 from relevance.store.compacting import altered, compact
 from relevance.store.dataset import Dataset
 from relevance.store.exporting import export
-from relevance.store.files import SPLITS, Files, Source, differences
+from relevance.store.files import LAYOUT, SPLITS, Files, Source, differences
 from relevance.store.images import (
     MEMBERS,
     VIEW_SIZE,
@@ -44,6 +44,7 @@ from relevance.store.tables import (
 )
 
 __all__ = [
+    "LAYOUT",
     "MEMBERS",
     "SCHEMAS",
     "SPLITS",

@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from relevance.store.dataset import Dataset
 from relevance.store.files import SPLITS
-from relevance.store.paths import DatasetError, is_remote, locate, replacing, writing
+from relevance.store.paths import DatasetError, absolute, is_remote, locate, replacing, writing
 from relevance.store.tables import TABLES, table_schema
 
 PICTURES = {"image": "scene.webp", "mask": "mask.png", "views": "views.webp"}
@@ -151,7 +151,7 @@ def _card(dataset: Dataset, rows: dict[tuple[str, str], int]) -> str:
         *head,
         "---",
         "",
-        f"# {dataset.path.name}",
+        f"# {absolute(dataset.path).name}",
         "",
         "Tabletop scenes, goals for a robot arm, the plans that a task-and-motion planner found,",
         "and which objects each plan has to move: the relevant ones.",

@@ -30,6 +30,8 @@ from relevance.store.paths import (
 from relevance.store.tables import TABLES, table_schema
 
 SPLITS = ("train", "validation", "test")
+LAYOUT = 1
+"""Version of dataset.json."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,6 +93,8 @@ class Files:
             raise DatasetError(f"{file}: expected a JSON object, found {error}") from None
         if not isinstance(description, dict):
             raise DatasetError(f"{file}: expected a JSON object, found {type(description)}")
+        if (layout := description.get("layout", LAYOUT)) != LAYOUT:
+            raise DatasetError(f"{file}: layout: expected {LAYOUT}, found {layout!r}")
         if description.get("changing"):
             raise DatasetError(
                 f"{file}: new plans were being put in the place of old ones when that was cut "

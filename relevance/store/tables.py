@@ -52,8 +52,6 @@ class TableSchema:
     """File within the dataset, with `{split}`, `{shard}`, `{predicate}`, `{name}` open."""
     columns: tuple[Column, ...]
     arrow: pa.Schema
-    stage: str
-    """What makes it: generate, label, train or evaluate."""
     beside: str = ""
     """Where files of another `Labelling` than the current one lie; empty when they do not."""
     sharded: bool = False
