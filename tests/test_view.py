@@ -249,7 +249,7 @@ def test_mistakes_are_one_line(tmp_path, capsys, monkeypatch):
         viewer.importlib.util, "find_spec", lambda name: None if name == "viser" else find(name)
     )
     assert "pip install 'relevance[view]'" in refused(file, "--goal", GOAL)
-    assert [one.name for one in tmp_path.iterdir()] == ["scene.json"]
+    assert {one.name for one in tmp_path.iterdir()} == {"scene.json", "bare"}
 
 
 def test_the_command_films_a_scene_file(tmp_path: Path, monkeypatch, capsys) -> None:
