@@ -239,7 +239,7 @@ def beta_accuracy(*axes: Axes, predictions: Predictions) -> None:
         ax.axvline(0, color=FAINT, linewidth=1)
         ax.set_ylim(0, 1.02)
         _percent_axis(ax.yaxis)
-    max(axes, key=lambda ax: len(ax.lines)).legend(loc="lower left")
+    max(reversed(axes), key=lambda ax: len(ax.lines)).legend(loc="lower center")
 
 
 def coverage(*axes: Axes, rows: Sequence[Covered]) -> None:
@@ -285,6 +285,7 @@ def scores(*axes: Axes, predictions: Predictions) -> None:
                     label = f"{name} (n = {len(scores)})"
                     weights = np.full(len(scores), 1 / len(scores))
                     ax.hist(scores, bins, weights=weights, color=color, alpha=0.65, label=label)
+            ax.margins(y=0.3)  # the legend's place
             ax.legend(loc="upper right")
         ax.axvline(0, color=MUTED, linewidth=1, linestyle=":")
         ax.grid(axis="x", visible=False)
