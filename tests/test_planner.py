@@ -58,6 +58,20 @@ def test_the_elbow_is_turned_aside_from_a_pole(at):
     assert penetration(scene, result) <= 1e-3
 
 
+@pytest.mark.parametrize("goal", ["on(c, r)", "in-front(b, c)"])
+def test_what_is_sunk_into_its_neighbours_leaves_them_without_going_deeper(goal):
+    """The hand and the box that it carries away meet neighbours of their true size."""
+    size, deep = (0.06, 0.05, 0.1), 0.95e-3
+    row = [
+        box(name, 0.0, k * (0.05 - deep), size=size)
+        for name, k in zip("cab", (-1, 0, 1), strict=True)
+    ]
+    scene = Scene(objects=(*row, box("r", -0.05, 0.35, RED)))
+    result = plan(scene, goal)
+    assert result.status == "solved", result.reason
+    assert penetration(scene, result) <= 1e-3
+
+
 def test_dense_check_of_the_plan_alone_equals_the_solvers(planned):
     for scene, _, result in planned:
         if result.status == "solved":

@@ -297,7 +297,7 @@ def test_path_gradient_equals_finite_differences():
 
     def merit(rows):
         return motions.assemble(
-            rows, at, body, obstacles, margin, samples, targets, seen, room, smooth,
+            rows, at, body, obstacles, obstacles, margin, samples, targets, seen, room, smooth,
             *multipliers, 7.0, 0.0, band, g,
         )[0]  # fmt: skip
 
@@ -352,10 +352,10 @@ def test_pairs_called_clear_are_clear_at_every_substep():
         if not hand_down(target, BASE, arm.lower, arm.upper, q):
             continue
         step = rng.normal(scale=0.08, size=ARM)
-        n = motions.close_pairs(at, q, q + step, body, obstacles, pairs)
+        n = motions.close_pairs(at, q, q + step, body, obstacles, obstacles, pairs)
         clear, skipped = clear + (n == 0), skipped + out.size - n
         for share in np.linspace(0, 1, 21):
-            motions.distances(at, q + share * step, body, obstacles, out)
+            motions.distances(at, q + share * step, body, obstacles, obstacles, out)
             out[tuple(pairs[:n].T)] = 1.0
             assert out.min() >= motions.CLEARANCE
 

@@ -86,10 +86,11 @@ def penetration(scene: Scene, result: PlanResult) -> float:
         if k % 3 == 2:  # the retreat
             pose = result.final[name]
             put_down(obstacles[i], pose.position, pose.yaw)
-        body = bodies(phase.opening, held if holding else None)
-        margin, over = np.zeros((len(body.link), there.sum())), np.zeros((len(phase.q) - 1, 2))
-        depth = dense_check(phase.q, problem.arm, body, obstacles[there], margin, over)
-        worst = max(worst, depth, upper_depth(problem, phase.q, obstacles[there][:-2]))
+        body, around = bodies(phase.opening, held if holding else None), obstacles[there]
+        beside = problem.beside(i, obstacles)[there] if holding else around
+        margin, over = np.zeros((len(body.link), len(around))), np.zeros((len(phase.q) - 1, 2))
+        depth = dense_check(phase.q, problem.arm, body, around, beside, margin, over)
+        worst = max(worst, depth, upper_depth(problem, phase.q, around[:-2]))
         if holding and held is not None:
             worst = max(worst, shoulder_depth(problem, phase.q, phase.opening, held))
     return worst

@@ -66,7 +66,8 @@ def first_half() -> None:
     grasp = grasps(problem.subject)[0]
     target, hand = pick_target(problem.subject, grasp), bodies(grasp.opening)
     rows = np.tile(HOME, (ROWS + 1, 1))
-    motion(rows, problem.arm, np.zeros(TARGET), False, target, hand, problem.obstacles)
+    around = problem.obstacles
+    motion(rows, problem.arm, np.zeros(TARGET), False, target, hand, around, around)
 
 
 def other_half() -> None:

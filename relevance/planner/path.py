@@ -66,6 +66,8 @@ class _Leg(NamedTuple):
     opening: float
     held: Held | None
     obstacles: np.ndarray
+    beside: np.ndarray
+    """The same as what is held meets them while it rises."""
 
 
 class PathBound:
@@ -121,7 +123,10 @@ class PathBound:
                 X = np.empty((ROWS + 1, ARM))
                 X[0], X[-1] = at, q[2 * j + k]
                 standing = obstacles[there]
-                legs.append(_Leg(name, k == 1, X, leave, leaving, arrive, opening, held, standing))
+                beside = problem.beside(i, obstacles)[there] if k else standing
+                legs.append(
+                    _Leg(name, k == 1, X, leave, leaving, arrive, opening, held, standing, beside)
+                )
                 at, leave, leaving = X[-1], arrive, True
             there[i] = True
             turned = finger_turn(arm, q[2 * j], q[2 * j + 1])
@@ -175,19 +180,23 @@ class PathBound:
 
     def _motion(self, leg: _Leg) -> tuple[float, float, float]:
         """`motion`; once more around the robot's shoulder, where what is carried meets it."""
-        found = self._clear(leg, leg.obstacles)
+        found = self._clear(leg, leg.obstacles, leg.beside)
         if leg.held is None or found[0] < 0:
             return found
         depth = shoulder_depth(self.problem, leg.X, leg.opening, leg.held)
         if depth > ALLOWED:
-            found = self._clear(leg, np.concatenate([self.problem.pillar, leg.obstacles]))
+            pillar = self.problem.pillar
+            around = (np.concatenate([pillar, rows]) for rows in (leg.obstacles, leg.beside))
+            found = self._clear(leg, *around)
             depth = shoulder_depth(self.problem, leg.X, leg.opening, leg.held)
         return (max(found[0], depth), *found[1:]) if found[0] >= 0 and depth <= ALLOWED else _NONE
 
-    def _clear(self, leg: _Leg, obstacles: np.ndarray) -> tuple[float, float, float]:
+    def _clear(
+        self, leg: _Leg, obstacles: np.ndarray, beside: np.ndarray
+    ) -> tuple[float, float, float]:
         """`motion`; among tall things once more with every link, where it brings one too near."""
         problem, ends = self.problem, (leg.leave, leg.leaving, leg.arrive)
-        found = motion(leg.X, problem.arm, *ends, bodies(leg.opening, leg.held), obstacles)
+        found = motion(leg.X, problem.arm, *ends, bodies(leg.opening, leg.held), obstacles, beside)
         if found[0] < 0:
             return found
         upper = upper_depth(problem, leg.X, leg.obstacles[:-2])
@@ -195,7 +204,8 @@ class PathBound:
             return max(found[0], upper), *found[1:]
         # The foot is under the links near the base: they are not asked to keep clear of it.
         every = bodies(leg.opening, leg.held, upper=True)
-        return motion(leg.X, problem.whole_arm, *ends, every, leg.obstacles[:-1])
+        boxes, beside = leg.obstacles[:-1], leg.beside[:-1]
+        return motion(leg.X, problem.whole_arm, *ends, every, boxes, beside)
 
     def _retreat(
         self, X: np.ndarray, put: np.ndarray, opening: float, obstacles: np.ndarray
@@ -214,7 +224,7 @@ def upper_depth(problem: Problem, X: np.ndarray, boxes: np.ndarray) -> float:
         return 0.0
     upper = upper_bodies()
     margin, broken = np.zeros((len(upper.link), len(boxes))), np.zeros((len(X) - 1, 2))
-    return dense_check(X, problem.whole_arm, upper, boxes, margin, broken)
+    return dense_check(X, problem.whole_arm, upper, boxes, boxes, margin, broken)
 
 
 def shoulder_depth(problem: Problem, X: np.ndarray, opening: float, held: Held) -> float:
@@ -226,7 +236,7 @@ def shoulder_depth(problem: Problem, X: np.ndarray, opening: float, held: Held) 
     still = X.copy()
     still[:, 0] = 0.0
     margin, over = np.zeros((1, 1)), np.zeros((len(X) - 1, 2))
-    return dense_check(still, problem.arm, body, problem.shoulder, margin, over)
+    return dense_check(still, problem.arm, body, problem.shoulder, problem.shoulder, margin, over)
 
 
 def put_down(row: np.ndarray, position: tuple[float, float, float], yaw: float) -> None:

@@ -61,7 +61,6 @@ class Problem:
         self.arm = arm_at(base)
         self.table = np.array(self.scene.table.size) / 2
         standing = [obstacle(box) for box in self.scene.objects]
-        self._unsink(np.array(standing), standing)
         self.obstacles = np.array([*standing, *self._fixtures()])
         tops = [box.top for box in self.scene.objects]
         self.tall = max(tops) - self.scene.robot.base[2] > LOW
@@ -82,14 +81,26 @@ class Problem:
         """What the goal relates it to, where it stands at first."""
         return self.boxes[self.goal.reference]
 
-    def _unsink(self, rows: np.ndarray, standing: list[np.ndarray]) -> None:
-        """Shrink boxes that are sunk into others (a scene may have that, up to a millimetre), so
-        that they only touch."""
-        for i, k in _neighbours(rows):
+    @cached_property
+    def _sunk(self) -> dict[int, dict[int, float]]:
+        """How deep boxes are sunk into others beside them (a scene may have that), m."""
+        found: dict[int, dict[int, float]] = {}
+        for i, k in _neighbours(self.obstacles[: len(self.boxes)]).tolist():
             sunk = -footprint_gap(self.scene.objects[i], self.scene.objects[k])
-            for row in (standing[i], standing[k]) if sunk > 0 else ():
-                x, y, z, yaw, hx, hy, hz = row[:7]
-                upright(x, y, z, yaw, max(hx - sunk, 1e-4), max(hy - sunk, 1e-4), hz, row)
+            if sunk > 0:
+                found.setdefault(i, {})[k] = found.setdefault(k, {})[i] = sunk
+        return found
+
+    def beside(self, i: int, obstacles: np.ndarray) -> np.ndarray:
+        """Obstacles as box i meets them while it rises from where it stood at first: what it is
+        sunk into and still stands there is shrunk, so that they only touch."""
+        rows = obstacles.copy()
+        for k, sunk in self._sunk.get(i, {}).items():
+            if (rows[k] == self.obstacles[k]).all():
+                x, y, z, yaw, hx, hy, hz = rows[k, :7]
+                hx, hy = max(hx - sunk, 1e-4), max(hy - sunk, 1e-4)
+                upright(x, y, z, yaw, hx, hy, hz, rows[k])
+        return rows
 
     def _fixtures(self) -> list[np.ndarray]:
         """What always stands there, as obstacles: the table and the robot's foot."""

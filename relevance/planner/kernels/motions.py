@@ -38,6 +38,8 @@ ROWS = 20
 """Steps of a motion; it has ROWS + 1 rows."""
 VERTICAL = 3
 """Rows beside a switch at which the hand is straight over it."""
+RISING = VERTICAL + 1
+"""Rows before this one, a box that is taken away still rises straight up."""
 RISE = 0.06
 """Height of the vertical parts, m."""
 CLEARANCE = 0.002
@@ -91,31 +93,35 @@ def reach_to(arm, q, target):
 
 
 @njit(cache=True)
-def distances(arm, q, bodies, obstacles, out):
-    """Separating-axis distance of every body and obstacle at q: out (B, W), m; 1 beyond FAR."""
+def distances(arm, q, bodies, obstacles, beside, out):
+    """Separating-axis distance of every body and obstacle at q: out (B, W), m; 1 beyond FAR.
+
+    beside (W, UPRIGHT): the obstacles as the last body meets them.
+    """
     p, R, normal, contact = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     look_at_frames(arm, q)
     for b in range(len(bodies.link)):
         at = bodies.link[b] * FRAME
         body_pose(arm.frames_y[at : at + FRAME], bodies.centre[b], bodies.turn[b], p, R)
-        for w in range(len(obstacles)):
+        others = beside if b == len(bodies.link) - 1 else obstacles
+        for w in range(len(others)):
             out[b, w] = 1.0
-            if near(p, bodies.radius[b] + FAR, obstacles[w]):
-                out[b, w] = separation(p, R, bodies.half[b], obstacles[w], normal, contact)
+            if near(p, bodies.radius[b] + FAR, others[w]):
+                out[b, w] = separation(p, R, bodies.half[b], others[w], normal, contact)
 
 
 @njit(cache=True)
 def assemble(
-    X, arm, bodies, obstacles, margin, samples, targets, seen, room, smooth, eq, ineq, limit, mu,
-    gain, band, g,
+    X, arm, bodies, obstacles, beside, margin, samples, targets, seen, room, smooth, eq, ineq,
+    limit, mu, gain, band, g,
 ):  # fmt: skip
     """Merit and Gauss-Newton model of the rows 1..T-1.
 
     With a gain above 0, the multipliers (eq, ineq, limit) are first moved along the violations.
     seen (S, 7), room (S, B): by how much each body was clear of everything at a configuration of
     each sample (m; 0 where it never was); it is not looked at again before it can have moved that
-    far from there. Returns (merit, violation) and fills band (n, WIDTH) as `banded_solve` wants
-    it, g (n,).
+    far from there. beside: as `motion` has it. Returns (merit, violation) and fills band (n, WIDTH)
+    as `banded_solve` wants it, g (n,).
     """
     T = len(X) - 1
     merit, worst = 0.0, 0.0
@@ -164,7 +170,7 @@ def assemble(
         t, alpha = int(samples[n, 0]), samples[n, 1]
         for i in range(ARM):
             q[i] = X[t, i] if alpha == 0.0 else (1 - alpha) * X[t, i] + alpha * X[t + 1, i]
-        looked = False
+        looked, rising = False, beside if t < RISING else obstacles
         for b in range(len(bodies.link)):
             shift = 0.0
             for i in range(ARM):
@@ -179,15 +185,14 @@ def assemble(
             frame = arm.frames_y[start : start + FRAME]
             body_pose(frame, bodies.centre[b], bodies.turn[b], p, R)
             room[n, b] = 1.0
-            for w in range(len(obstacles)):
-                gap = apart(p, bodies.radius[b] + margin[b, w], obstacles[w])
+            others = rising if b == len(bodies.link) - 1 else obstacles
+            for w in range(len(others)):
+                gap = apart(p, bodies.radius[b] + margin[b, w], others[w])
                 if ineq[n, b, w] == 0.0 and gap > 0:
                     room[n, b] = min(room[n, b], gap)
                     continue
                 room[n, b] = 0.0
-                value = margin[b, w] - separation(
-                    p, R, bodies.half[b], obstacles[w], normal, contact
-                )
+                value = margin[b, w] - separation(p, R, bodies.half[b], others[w], normal, contact)
                 ineq[n, b, w] = max(0.0, ineq[n, b, w] + gain * value)
                 worst = max(worst, value)
                 shifted = value + ineq[n, b, w] / mu
@@ -212,7 +217,7 @@ def assemble(
 
 
 @njit(cache=True)
-def solve(X, arm, bodies, obstacles, margin, samples, targets):
+def solve(X, arm, bodies, obstacles, beside, margin, samples, targets):
     """Improve the rows X (T + 1, 7) in place, first and last fixed; returns the violation.
 
     targets (T + 1, TARGET + 1): hand target of the vertical rows, last column 1 there.
@@ -229,8 +234,8 @@ def solve(X, arm, bodies, obstacles, margin, samples, targets):
     mu, gain, worst = 3000.0, 0.0, 1e9
     for outer in range(8):
         merit, worst = assemble(
-            X, arm, bodies, obstacles, margin, samples, targets, seen, room, smooth, eq, ineq,
-            limit, mu, gain, band, g,
+            X, arm, bodies, obstacles, beside, margin, samples, targets, seen, room, smooth, eq,
+            ineq, limit, mu, gain, band, g,
         )  # fmt: skip
         for _ in range(12):
             for i in range(n):
@@ -246,8 +251,8 @@ def solve(X, arm, bodies, obstacles, margin, samples, targets):
                     for i in range(ARM):
                         X[t, i] = old[t, i] + scale * step[(t - 1) * ARM + i]
                 new, worst = assemble(
-                    X, arm, bodies, obstacles, margin, samples, targets, seen, room, smooth, eq,
-                    ineq, limit, mu, 0.0, band, g,
+                    X, arm, bodies, obstacles, beside, margin, samples, targets, seen, room,
+                    smooth, eq, ineq, limit, mu, 0.0, band, g,
                 )  # fmt: skip
                 if new <= merit + 1e-4 * scale * slope + 1e-12:
                     break
@@ -262,19 +267,20 @@ def solve(X, arm, bodies, obstacles, margin, samples, targets):
 
 
 @njit(cache=True)
-def dense_check(X, arm, bodies, obstacles, margin, broken):
+def dense_check(X, arm, bodies, obstacles, beside, margin, broken):
     """Worst penetration (m, 0 if none) over all sub-steps of the rows X.
 
     Pairs that stay clear of each other during a step are not looked at more closely.
-    Fills broken (T, 2) for each step: the sub-step share where its margin is broken most, and
-    by how much (m, 0 if kept).
+    beside: as `motion` has it. Fills broken (T, 2) for each step: the sub-step share where its
+    margin is broken most, and by how much (m, 0 if kept).
     """
     pairs = np.zeros((len(bodies.link) * len(obstacles), 2), np.int64)
     p, R, normal, contact = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     q, worst = np.zeros(ARM), 0.0
     broken[:, :] = 0.0
     for t in range(len(X) - 1):
-        n = close_pairs(arm, X[t], X[t + 1], bodies, obstacles, pairs)
+        rising = beside if t < RISING else obstacles
+        n = close_pairs(arm, X[t], X[t + 1], bodies, obstacles, rising, pairs)
         for k in range(SUBSTEPS + 1 if n else 0):
             share = k / SUBSTEPS
             for i in range(ARM):
@@ -287,7 +293,8 @@ def dense_check(X, arm, bodies, obstacles, margin, broken):
                     at = bodies.link[b] * FRAME
                     body_pose(arm.frames_y[at : at + FRAME], bodies.centre[b], bodies.turn[b], p, R)
                     before = b
-                gap = separation(p, R, bodies.half[b], obstacles[w], normal, contact)
+                others = rising if b == len(bodies.link) - 1 else obstacles
+                gap = separation(p, R, bodies.half[b], others[w], normal, contact)
                 worst = max(worst, -gap)
                 if margin[b, w] - gap > broken[t, 1]:
                     broken[t, 0], broken[t, 1] = share, margin[b, w] - gap
@@ -295,11 +302,12 @@ def dense_check(X, arm, bodies, obstacles, margin, broken):
 
 
 @njit(cache=True)
-def close_pairs(arm, q0, q1, bodies, obstacles, pairs):
+def close_pairs(arm, q0, q1, bodies, obstacles, beside, pairs):
     """Which bodies may come within CLEARANCE of which obstacles on the way from q0 to q1.
 
     By their distance half-way and how far each body moves from there, to first order with a
-    quarter to spare for the rest. Fills pairs (B W, 2), body by body; returns how many.
+    quarter to spare for the rest. beside (W, UPRIGHT): the obstacles as the last body meets them.
+    Fills pairs (B W, 2), body by body; returns how many.
     """
     q, count = np.zeros(ARM), 0
     for i in range(ARM):
@@ -320,27 +328,29 @@ def close_pairs(arm, q0, q1, bodies, obstacles, pairs):
                 w += frame[33 + ARM * axis + i] * (q1[i] - q0[i])
             shift, turn = shift + v * v, turn + w * w
         reach = CLEARANCE + 0.625 * (math.sqrt(shift) + math.sqrt(turn) * arm_length)
-        for w in range(len(obstacles)):
-            if not near(p, bodies.radius[b] + reach, obstacles[w]):
+        others = beside if b == len(bodies.link) - 1 else obstacles
+        for w in range(len(others)):
+            if not near(p, bodies.radius[b] + reach, others[w]):
                 continue
-            if separation(p, R, bodies.half[b], obstacles[w], normal, contact) < reach:
+            if separation(p, R, bodies.half[b], others[w], normal, contact) < reach:
                 pairs[count, 0], pairs[count, 1] = b, w
                 count += 1
     return count
 
 
 @njit(cache=True)
-def motion(X, arm, leave, leaving, arrive, bodies, obstacles) -> tuple[float, float, float]:
+def motion(X, arm, leave, leaving, arrive, bodies, obstacles, beside) -> tuple[float, float, float]:
     """Fill the rows X (ROWS + 1, 7) between its first and last.
 
     leave / arrive: hand targets of the two switches; without `leaving` the motion starts
-    free. Returns the worst penetration (m; -1 where no motion was found that keeps the dense
-    check well within ALLOWED), the cost (rad^2) and the time between rows (s).
+    free. beside: the obstacles (W, UPRIGHT) as the last body, the box in the hand if there is one,
+    meets them while it rises. Returns the worst penetration (m; -1 where no motion was found that
+    keeps the dense check well within ALLOWED), the cost (rad^2) and the time between rows (s).
     """
     shape = (len(bodies.link), len(obstacles))
     first, last = np.zeros(shape), np.zeros(shape)
-    distances(arm, X[0], bodies, obstacles, first)
-    distances(arm, X[ROWS], bodies, obstacles, last)
+    distances(arm, X[0], bodies, obstacles, beside, first)
+    distances(arm, X[ROWS], bodies, obstacles, obstacles, last)
     margin = first
     for b in range(len(first)):
         for w in range(len(obstacles)):
@@ -360,9 +370,9 @@ def motion(X, arm, leave, leaving, arrive, bodies, obstacles) -> tuple[float, fl
     broken = np.zeros((ROWS, 2))
     depth = 0.0
     for _ in range(_EXCHANGES):
-        if solve(X, arm, bodies, obstacles, margin, samples[:n], targets) > 1.5e-3:
+        if solve(X, arm, bodies, obstacles, beside, margin, samples[:n], targets) > 1.5e-3:
             return -1.0, 0.0, 0.0
-        depth = dense_check(X, arm, bodies, obstacles, margin, broken)
+        depth = dense_check(X, arm, bodies, obstacles, beside, margin, broken)
         most = 0.0
         for t in range(ROWS):
             most = max(most, broken[t, 1])
@@ -454,5 +464,5 @@ def retreat(X, arm, leave, bodies, obstacles) -> tuple[float, float, float]:
         if not reach_to(arm, X[t], target) or not _within_limits(arm, X[t]):
             return -1.0, 0.0, 0.0
     margin = np.zeros((len(bodies.link), len(obstacles)))
-    depth = dense_check(X, arm, bodies, obstacles, margin, np.zeros((steps, 2)))
+    depth = dense_check(X, arm, bodies, obstacles, obstacles, margin, np.zeros((steps, 2)))
     return depth, acceleration_cost(X), time_step(arm, X)
