@@ -8,7 +8,7 @@ import pytest
 
 from relevance.benchmarks.reference import CLEARANCE, shortest
 from relevance.planner import PlannerConfig, penetration, plan
-from relevance.scene import PREDICATES, Box, Scene, SceneError, goal_holds
+from relevance.scene import PREDICATES, Box, Scene, SceneError, Table, goal_holds
 from relevance.simulation import replay
 from tests.planning import BLUE, GREEN, GREY, OPEN, RED, box, tasks
 
@@ -132,6 +132,16 @@ def test_blocker_beside_the_reference_is_moved():
     assert result.status == "solved"
     assert result.moved == ("grey", "red")
     assert replay(scene, result.goal, result.phases).ok
+
+
+def test_a_table_may_be_as_large_as_a_plane():
+    """What is put aside stays within reach: no more of the table is looked at."""
+    objects = *OPEN.objects, box("grey", 0.0, -0.07)
+    usual, plane = (
+        plan(Scene(objects=objects, table=Table(size=size)), "on-the-left(red, blue)")
+        for size in (Table().size, (1e6, 1e6))
+    )
+    assert usual.moved == plane.moved == ("grey", "red")
 
 
 def test_a_decision_that_a_tenth_of_a_millimetre_turns_is_flagged():

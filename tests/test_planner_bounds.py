@@ -403,6 +403,20 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
     assert found > 3
 
 
+def test_only_what_the_arm_could_reach_of_a_region_is_looked_at():
+    base, table = np.array([-0.48, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.3, 0.25, 0.5])
+    np.testing.assert_array_equal(planar.near_base(table, base), table)
+    np.testing.assert_allclose(
+        planar.near_base(np.array([0.0, 0.0, math.pi / 2, 1e5, 0.5]), base),
+        [0.0, 0.0, math.pi / 2, planar.FARTHEST, 0.5],
+        atol=1e-9,
+    )
+    np.testing.assert_allclose(
+        planar.near_base(np.array([1.0, 0.0, 0.0, 0.5, 0.5]), base), [0.61, 0, 0, 0.11, 0.5]
+    )
+    assert planar.near_base(np.array([3.0, 0.0, 0.0, 0.5, 0.5]), base)[3] < 0
+
+
 def test_compiled_kernels_are_kept_by_the_content_of_all_their_sources(tmp_path):
     (tmp_path / "inner").mkdir()
     for name in ("a.py", "inner/b.py"):

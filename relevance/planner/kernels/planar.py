@@ -17,6 +17,8 @@ from relevance.scene.geometry import UPRIGHT, rectangle_gap, upright
 
 COMFORT = 0.008
 """Clearance beyond MARGIN with which a pose is taken at once, m."""
+FARTHEST = 1.2
+"""Farther from the robot's base along an axis of a region, no hand puts anything down, m."""
 NODE_LIMIT = 4000
 MAX_LEVEL = 6
 TURN, TURN_MARGIN, ANY_TURN = 0.1, 0.02, 4.0
@@ -102,6 +104,22 @@ def slack(x, y, angle, bottom, parts, obstacles, table, base, reach, enough):
 
 
 @njit(cache=True)
+def near_base(region, base):
+    """The part of a rectangle (5,) that is not beyond FARTHEST, with half extents below 0 where
+    none is; exactly the rectangle where all of it is near."""
+    c, s = math.cos(region[2]), math.sin(region[2])
+    dx, dy, near = base[0] - region[0], base[1] - region[1], region.copy()
+    for axis in range(2):
+        u, half = (c * dx + s * dy if axis == 0 else c * dy - s * dx), region[3 + axis]
+        low, high = max(-half, u - FARTHEST), min(half, u + FARTHEST)
+        middle = (low + high) / 2
+        near[0] += middle * (c if axis == 0 else -s)
+        near[1] += middle * (s if axis == 0 else c)
+        near[3 + axis] = (high - low) / 2
+    return near
+
+
+@njit(cache=True)
 def find_pose(region, prefer, bottom, parts, obstacles, table, base, reach, ease, pose):
     """Branch and bound for a free pose whose centre lies in a rectangle.
 
@@ -111,7 +129,10 @@ def find_pose(region, prefer, bottom, parts, obstacles, table, base, reach, ease
     coarsest level that has a free one, or the clearest of that level.
     Returns (FOUND | NONE | UNDECIDED, the slack of the best pose seen, m).
     """
+    region = near_base(region, base)  # the cells are as many as the region is large
     a, b = region[3], region[4]
+    if min(a, b) < 0:
+        return NONE, -1.0
     c, s = math.cos(region[2]), math.sin(region[2])
     nx, ny, na = max(1, math.ceil(a / 0.025)), max(1, math.ceil(b / 0.025)), 6
     hx, hy, ha = a / nx, b / ny, math.pi / (2 * na)
