@@ -342,6 +342,13 @@ def test_bad_settings_are_named(field, value):
         SceneConfig(**{field: value})
 
 
+def test_a_vast_table_is_looked_at_within_reach_alone():
+    vast = Table(size=(1e6, 1e6))
+    assert SceneConfig(table=vast).table == vast
+    with pytest.raises(ValueError, match="camera"):
+        SceneConfig(table=vast, camera=Camera(target=(-2, 0, 1)))
+
+
 def test_config_hash_sees_every_setting():
     base = SceneConfig()
     assert base.content_hash == SceneConfig().content_hash

@@ -160,7 +160,11 @@ class SceneConfig:
 
     def _in_sight(self) -> bool:
         """Whether the camera sees any of the places where boxes may stand, 5 cm apart."""
-        edges = (np.arange(-edge / 2, edge / 2, 0.05) + 0.025 for edge in self.table.size)
+        far, edges = self.reach[1], []
+        for edge, base in zip(self.table.size, self.robot.base, strict=False):
+            # a table may be vast: only its rows within reach
+            rows = np.clip((np.array([base - far, base + far]) + edge / 2) / 0.05, 0, edge / 0.05)
+            edges.append(np.arange(np.floor(rows[0]), np.ceil(rows[1])) * 0.05 - edge / 2 + 0.025)
         x, y = (places.ravel() for places in np.meshgrid(*edges))
         distance = np.hypot(x - self.robot.base[0], y - self.robot.base[1])
         within = (self.reach[0] <= distance) & (distance <= self.reach[1])
