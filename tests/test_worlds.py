@@ -288,6 +288,30 @@ def test_what_is_left_out_and_why(client: int, make: Make, why: str, warned: boo
     assert [str(one.message) for one in told] == ([str(note)] if warned else [])
 
 
+@pytest.mark.parametrize(
+    ("z", "turn", "done"),
+    [
+        (0.0, FLAT, "left out: it is not over the table's top"),
+        (-0.6, FLAT, "left out: it is not over the table's top"),
+        (0.3, FLAT, "left out: it lies 300 mm over the table's top, expected it no higher"),
+        (0.0, turned(0.5, 0, 0), "left out: it is not level, expected ground"),
+    ],
+)
+def test_the_ground_may_be_a_plane(client: int, z: float, turn, done: str) -> None:
+    ground = add(client, pybullet.GEOM_PLANE, (0, 0, z), turn)
+    add_box(client, (0.05, 0.05, 0.05), (0.2, 0.2, 0.025))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        world = read_bullet(client)
+    assert len(world.scene.objects) == 1
+    [note] = world.notes
+    assert note.what == "a plane"
+    assert note.done == done
+    assert [str(one.message) for one in told] == ([str(note)] if "expected" in done else [])
+    with pytest.raises(WorldError, match="table 0: is a plane without edges"):
+        read_bullet(client, table=ground)
+
+
 def test_bodies_with_joints_are_left_out(client: int) -> None:
     usual(client)
     add_box(client, (0.05, 0.05, 0.05), (0.5, 0.2, 0.65))

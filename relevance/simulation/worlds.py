@@ -39,12 +39,13 @@ SETTLED = 0.005
 _NAME = "relevance-name"  # user data of bodies that a scene was written to
 _TABLE_THICKNESS = 0.05
 _DIGITS = 6  # pybullet keeps places as single floats; what is written comes back the same
+_PLANE = "a plane"
 _KINDS = {
     pybullet.GEOM_SPHERE: "a sphere",
     pybullet.GEOM_BOX: "a box",
     pybullet.GEOM_CYLINDER: "a cylinder",
     pybullet.GEOM_MESH: "a mesh",
-    pybullet.GEOM_PLANE: "a plane",
+    pybullet.GEOM_PLANE: _PLANE,
     pybullet.GEOM_CAPSULE: "a capsule",
 }
 
@@ -109,9 +110,10 @@ def read_bullet(
 
     Boxes are read from collision shapes, where a body has none from visual ones; one that lies on
     its side is a box of other edges. Any other body that stands on the table, a tilted box too, is
-    taken as the upright box around it. Left out are bodies under or beside the table, and with a
-    RelevanceWarning those that float, reach over the table's edge, or have joints. `World.notes`
-    says so of every body. A SceneError names a box that cannot stand where it does.
+    taken as the upright box around it. Left out are bodies under or beside the table, planes as the
+    ground mostly is one, and with a RelevanceWarning those that float, reach over the table's edge,
+    or have joints, and planes that rise over its top. `World.notes` says so of every body. A
+    SceneError names a box that cannot stand where it does.
 
     client: its number, or a BulletClient.
     robot, table: their bodies; by default those that are called so (`panda`, `table`). Without a
@@ -243,6 +245,8 @@ class _Reader:
         if not shapes:
             return self.note(body, "a body without a shape to touch", "left out")
         shapes = [replace(shape, pose=_times(self.inverse, shape.pose)) for shape in shapes]
+        if any(shape.kind == _PLANE for shape in shapes):
+            return self._ground(body, shapes)
         alone = shapes[0] if len(shapes) == 1 else None
         what = alone.kind if alone else f"a body of {len(shapes)} shapes"
         exact = alone.upright() if alone else None
@@ -274,6 +278,17 @@ class _Reader:
         frame = pybullet.invertTransform(*_upright(position, yaw))
         self.frames[box.name] = _times(frame, _times(self.inverse, there))
         return None
+
+    def _ground(self, body: int, shapes: Sequence[_Shape]) -> None:
+        """A plane has no edges: nothing stands on it but what stands on the table, too."""
+        over = max(shape.rise for shape in shapes if shape.kind == _PLANE)
+        if math.isinf(over):
+            why = "it is not level, expected ground"
+        elif over > CONTACT_TOLERANCE:
+            why = f"it lies {1000 * over:.0f} mm over the table's top, expected it no higher"
+        else:
+            why = "it is not over the table's top"
+        self.note(body, _PLANE, f"left out: {why}", warn=over > CONTACT_TOLERANCE)
 
     def settled(self) -> list[Box]:
         """The boxes, each right on what it stands on, in the order of the bodies; those that
@@ -320,7 +335,7 @@ class _Shape:
     kind: str
     dimensions: tuple[float, float, float]
     """Edges of a box; length and radius of a cylinder and a capsule; radius of a sphere; edges of
-    the upright box around a mesh."""
+    the upright box around a mesh; the normal of a plane."""
     pose: BodyPose
 
     @property
@@ -345,8 +360,14 @@ class _Shape:
         size = [self.dimensions[axis] for axis in (x, y, up)]
         return size, self.pose[0], math.atan2(axes[1, x], axes[0, x])
 
+    @property
+    def rise(self) -> float:
+        """Height of a plane, m; infinite where it is not level."""
+        normal = self.axes @ np.array(self.dimensions)
+        return self.pose[0][2] if normal[2] >= math.cos(UPRIGHT) else math.inf
+
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of what is around it, (3,) each, m."""
+        """Lowest and highest corner of what is around it, no plane, (3,) each, m."""
         axes, (a, b, _) = self.axes, self.dimensions
         if self.kind == "a sphere":
             half = np.full(3, a)
@@ -432,6 +453,8 @@ def _table(client: int, body: int | None, robot: int | None) -> tuple[BodyPose, 
     slabs = [found for shape in shapes if (found := shape.upright())]
     if not shapes:
         raise WorldError(f"table {body}: has no shape to stand on, expected one")
+    if any(shape.kind == _PLANE for shape in shapes):
+        raise WorldError(f"table {body}: is a plane without edges, expected a body with some")
     if not slabs and any(shape.kind == "a box" for shape in shapes):
         raise WorldError(f"table {body}: is tilted, expected its top level")
     size, (x, y, z), yaw = max(
