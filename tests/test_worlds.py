@@ -269,6 +269,8 @@ def test_other_shapes_are_the_box_around_them(client: int, make: Make, what: str
     ("make", "why", "warned"),
     [
         (lambda c: add_box(c, (0.1, 0.1, 0.1), (0, 0, -0.05)), "under the table's top", False),
+        (lambda c: add_box(c, (9, 9, 0.01), (0, 0, -0.0043)), "under the table's top", False),
+        (lambda c: add_box(c, (0.1, 0.1, 5e-5), (0, 0, 3e-5)), "thinner than 0.1 mm", True),
         (lambda c: add_box(c, (0.1, 0.1, 0.1), (0, 0.9, 0.05)), "beside the table", False),
         (lambda c: add_box(c, (0.1, 0.1, 0.1), (0, 0.59, 0.05)), "over the table's edge", True),
         (lambda c: add_box(c, (0.1, 0.1, 0.1), (0, 0, 0.3)), "floats 250 mm over", True),
@@ -286,6 +288,15 @@ def test_what_is_left_out_and_why(client: int, make: Make, why: str, warned: boo
     assert note.body == body
     assert why in note.done
     assert [str(one.message) for one in told] == ([str(note)] if warned else [])
+
+
+def test_a_thin_sheet_stands_on_the_table(client: int) -> None:
+    sheet = add_box(client, (0.1, 0.1, 8e-4), (0.0, 0.2, 4e-4))
+    box = add_box(client, (0.05, 0.05, 0.05), (0.0, 0.2, 0.0258))
+    world = read_bullet(client, names={sheet: "sheet", box: "box"})
+    assert world.notes == ()
+    assert world.scene["sheet"].size[2] == pytest.approx(8e-4)
+    assert world.scene["box"].on == "sheet"
 
 
 @pytest.mark.parametrize(

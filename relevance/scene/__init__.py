@@ -11,6 +11,7 @@ a scene loads no compiler.
 
 from relevance.scene.boxes import (
     TEXTURES,
+    THINNEST,
     Box,
     Camera,
     Color,
@@ -46,6 +47,7 @@ __all__ = [
     "GAP",
     "PREDICATES",
     "TEXTURES",
+    "THINNEST",
     "Action",
     "Box",
     "Camera",

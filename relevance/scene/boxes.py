@@ -17,7 +17,9 @@ from relevance.scene.words import Name
 _FAR = 1e6  # m; beyond, and for far more turns than this, digits are lost
 
 Length = Annotated[float, Strict(), Field(gt=0, le=_FAR)]
-Edge = Annotated[Length, Field(ge=1e-4)]
+THINNEST = 1e-4
+"""Shortest edge, m."""
+Edge = Annotated[Length, Field(ge=THINNEST)]
 Unit = Annotated[float, Strict(), Field(ge=0, le=1)]
 Metres = Annotated[float, Strict(), Field(ge=-_FAR, le=_FAR)]
 Angle = Annotated[float, Strict(), Field(ge=-_FAR, le=_FAR)]

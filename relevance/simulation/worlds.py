@@ -20,6 +20,7 @@ from relevance.errors import RelevanceError, RelevanceWarning
 from relevance.robot import panda_urdf
 from relevance.scene import (
     CONTACT_TOLERANCE,
+    THINNEST,
     Box,
     Camera,
     Color,
@@ -253,8 +254,12 @@ class _Reader:
         size, position, yaw = exact or _around(shapes)
         if alone and alone.kind == "a box" and exact is None:
             what = f"a box tilted by {math.degrees(alone.tilt):.0f} degrees"
-        if position[2] + size[2] / 2 <= CONTACT_TOLERANCE:
+        # by its middle, too: a thin sheet on the table rises over it by no more than that
+        if position[2] <= 0 and position[2] + size[2] / 2 <= CONTACT_TOLERANCE:
             return self.note(body, what, "left out: it is under the table's top")
+        if min(_rounded(size)) < THINNEST:
+            thin = f"left out: it is thinner than {1000 * THINNEST:g} mm"
+            return self.note(body, what, thin, warn=True)
         box = Box(
             name=self.names[body],
             size=_rounded(size),
