@@ -340,6 +340,8 @@ def test_errors_name_what_is_wrong(client: int) -> None:
         read_bullet(client)
     with pytest.raises(WorldError, match="table 3: no such body, expected one of none: the world"):
         read_bullet(client, table=3)
+    with pytest.raises(WorldError, match="ignore 99: no such body, expected one of none: the"):
+        read_bullet(client, ignore=[99])
     with pytest.raises(WorldError, match="client 19: not connected"):
         read_bullet(19)
     box = add_box(client, (0.05, 0.05, 0.05), (0.2, 0.2, 0.025))

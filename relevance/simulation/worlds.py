@@ -129,7 +129,8 @@ def read_bullet(
         pybullet.getBodyUniqueId(place, physicsClientId=number)
         for place in range(pybullet.getNumBodies(physicsClientId=number))
     ]
-    for what, given in (("robot", robot), ("table", table)):
+    left_out = [("ignore", body) for body in ignore]
+    for what, given in (("robot", robot), ("table", table), *left_out):
         if given is not None and given not in bodies:
             known = ", ".join(map(str, bodies)) or "none: the world is empty"
             raise WorldError(f"{what} {given}: no such body, expected one of {known}")
