@@ -235,9 +235,15 @@ def test_goal_text_round_trip(predicate):
     "text", ["", "on", "on(a)", "on(a, b", "on(a, b, c)", "on(, b)", "over(a, b)", "on(a, a)"]
 )
 def test_bad_goal_text(text):
-    with pytest.raises(SceneError, match="goal") as caught:
+    with pytest.raises(SceneError, match="(?i)goal") as caught:
         Goal.parse(text)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("subject", "reference"), [("a", "a"), ("\u00e9", "e\u0301")])
+def test_a_goal_is_of_two_objects_however_it_is_made(subject, reference):
+    with pytest.raises(SceneError, match=r"^Goal: .*subject and reference are the same object"):
+        Goal(predicate="on", subject=subject, reference=reference)
 
 
 def test_scene_knows_its_objects():

@@ -13,7 +13,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass as plain_dataclass
 from typing import Annotated, Any, Protocol
 
-from pydantic import AfterValidator, BeforeValidator, InstanceOf, PlainSerializer
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    InstanceOf,
+    PlainSerializer,
+    model_validator,
+)
 
 from relevance.registry import Registry
 from relevance.scene.boxes import Box, Robot
@@ -195,6 +201,12 @@ class Goal:
     subject: Annotated[str, AfterValidator(normal)]
     reference: Annotated[str, AfterValidator(normal)]
 
+    @model_validator(mode="after")
+    def _of_two(self) -> Goal:
+        if self.subject == self.reference:
+            raise ValueError(f"{shown(str(self))}: subject and reference are the same object")
+        return self
+
     def __str__(self) -> str:
         return f"{self.predicate}({self.subject}, {self.reference})"
 
@@ -210,8 +222,6 @@ class Goal:
             found, known = shown(name.strip()), ", ".join(PREDICATES)
             raise SceneError(f"{where}: unknown predicate {found}, expected one of {known}")
         predicate = PREDICATES[name.strip()]
-        if names[0] == names[1]:
-            raise SceneError(f"{where}: subject and reference are the same object")
         return cls(predicate=predicate, subject=names[0], reference=names[1])
 
 
