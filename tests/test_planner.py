@@ -217,6 +217,18 @@ def test_node_limit_is_a_status():
     assert result.reason.startswith("node limit: 1 ")
 
 
+def test_what_may_be_moved_is_a_list_of_names_in_any_normal_form():
+    accented = Scene(objects=(box("\u00e9", 0.0, 0.25, RED), box("b", 0.0, -0.15, BLUE)))
+    assert plan(accented, "on(e\u0301, b)", movable=["e\u0301"], replay=False).status == "solved"
+    for movable, words in (
+        ("b", "movable: expected a list of names, found 'b'"),
+        (["c"], "movable: no object 'c', expected some of \u00e9, b"),
+        ([3], "movable: no object '3'"),
+    ):
+        with pytest.raises(SceneError, match=words):
+            plan(accented, "on(b, \u00e9)", movable=movable)
+
+
 def test_bad_input_is_one_clear_line():
     for goal, words in (
         ("beside(red, blue)", "unknown predicate 'beside'"),

@@ -235,7 +235,7 @@ def test_goal_text_round_trip(predicate):
     "text", ["", "on", "on(a)", "on(a, b", "on(a, b, c)", "on(, b)", "over(a, b)", "on(a, a)"]
 )
 def test_bad_goal_text(text):
-    with pytest.raises(SceneError, match="(?i)goal") as caught:
+    with pytest.raises(SceneError, match=r"[Gg]oal") as caught:
         Goal.parse(text)
     assert "\n" not in str(caught.value)
 

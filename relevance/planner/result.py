@@ -17,6 +17,7 @@ from relevance.configs import config
 from relevance.planner.guides import Guide
 from relevance.registry import Registry
 from relevance.scene import Action, Goal, Phase, Pose, Scene, SceneError
+from relevance.scene.words import normal, shown
 
 if TYPE_CHECKING:  # it imports pybullet, which planning does without
     from relevance.simulation import Replay
@@ -138,9 +139,13 @@ PLANNERS: Registry[Planner] = Registry("planner")
 
 def movable_names(scene: Scene, movable: Collection[str] | None) -> frozenset[str]:
     """Names of what may be moved (None: all); raises SceneError for an unknown one."""
-    names = frozenset(scene.names if movable is None else movable)
+    if isinstance(movable, str):  # else its letters would be names
+        raise SceneError(f"movable: expected a list of names, found {shown(movable)}")
+    given = scene.names if movable is None else map(str, movable)
+    names = frozenset(map(normal, given))
     for name in names - set(scene.names):
-        raise SceneError(f"movable: no object {name!r}, expected some of {', '.join(scene.names)}")
+        known = ", ".join(scene.names)
+        raise SceneError(f"movable: no object {shown(name)}, expected some of {known}")
     return names
 
 
