@@ -73,7 +73,7 @@ def test_a_support_must_be_under_it_and_touch():
         *PILLARS[:2], box("far", 0.35), plate(0.0, 0.0, ["a", "b", "far"])
     )
     assert "on = 'd'" in refused(*PILLARS[:2], plate(0.0, 0.0, ["a", "d"]))
-    for bad in ([], ["a", "a"]):
+    for bad in ([], ["a", "a"], ["\u00e9", "e\u0301"]):
         with pytest.raises(SceneError, match="a list of distinct names"):
             plate(0.0, 0.0, bad)
     for bad in ([[]], [None], [["a"]]):

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, Strict, model_validator
 
 from relevance.scene.checks import checked
-from relevance.scene.words import Name
+from relevance.scene.words import Name, normal
 
 _FAR = 1e6  # m; beyond, and for far more turns than this, digits are lost
 
@@ -41,7 +41,7 @@ def _supports(value: Any) -> Any:
     """One name instead of a list of one; what is no name is refused later, by its type."""
     if not isinstance(value, list | tuple):
         return value
-    if not value or len(set(map(str, value))) < len(value):
+    if not value or len({normal(str(name)) for name in value}) < len(value):
         raise ValueError("expected null, a name or a list of distinct names")
     alone = len(value) == 1 and isinstance(value[0], str)
     return value[0] if alone else tuple(value)
