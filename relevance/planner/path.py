@@ -43,7 +43,8 @@ class Motion:
     phases: tuple[Phase, ...]
     final: dict[str, Pose]
     cost: float
-    """Squared joint accelerations, summed over rows, and the prices of the holds, rad^2."""
+    """Squared joint accelerations (second differences of rows), summed over the rows of all phases,
+    and the prices of the holds, rad^2."""
     max_penetration: float
     """Deepest penetration at the sub-steps of the dense check, m."""
 

@@ -87,8 +87,8 @@ class PlanResult:
     """Moved objects of every plan of this length that was found, in order; the best first."""
     final: dict[str, Pose]
     cost: float = math.nan
-    """Squared joint accelerations, summed over rows, rad^2; of our planner with the prices of its
-    holds."""
+    """Squared joint accelerations (second differences of rows, no clock), summed over the rows of
+    all phases, rad^2; of our planner with the prices of its holds."""
     ambiguous: bool = False
     """Whether another set of moved objects does as well, a bound was left open or a late one
     refused, or a box standing 0.2 mm elsewhere might have changed a decision."""

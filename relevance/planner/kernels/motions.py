@@ -344,8 +344,8 @@ def motion(X, arm, leave, leaving, arrive, bodies, obstacles, beside) -> tuple[f
 
     leave / arrive: hand targets of the two switches; without `leaving` the motion starts
     free. beside: the obstacles (W, UPRIGHT) as the last body, the box in the hand if there is one,
-    meets them while it rises. Returns the worst penetration (m; -1 where no motion was found that
-    keeps the dense check well within ALLOWED), the cost (rad^2) and the time between rows (s).
+    meets them while it rises. Returns the worst penetration (m; -1 where no motion was found, or
+    one that penetrates by more than 0.8 ALLOWED), the cost (rad^2) and the time between rows (s).
     """
     shape = (len(bodies.link), len(obstacles))
     first, last = np.zeros(shape), np.zeros(shape)
