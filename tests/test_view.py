@@ -243,7 +243,12 @@ def test_mistakes_are_one_line(tmp_path, capsys, monkeypatch):
     assert "no plans there, expected `relevance label` first" in refused(bare, *film)
     assert "a file that ends in .gif" in refused(file, "--gif", tmp_path / "plan.mp4")
     assert "is no folder" in refused(file, "--gif", tmp_path / "no" / "plan.gif")
+    (tmp_path / "folder.gif").mkdir()
+    assert "is a folder, expected a file" in refused(file, "--gif", tmp_path / "folder.gif")
+    (tmp_path / "folder.gif").rmdir()
     assert "expected one of none" in refused(file, "--guide", "x", *film)
+    unguided = ("--guide", "none", "--checkpoint", "nosuch")
+    assert "--guide and --checkpoint go together" in refused(file, *film, *unguided)
     find = viewer.importlib.util.find_spec
     monkeypatch.setattr(
         viewer.importlib.util, "find_spec", lambda name: None if name == "viser" else find(name)
@@ -260,5 +265,4 @@ def test_the_command_films_a_scene_file(tmp_path: Path, monkeypatch, capsys) -> 
     films = ("--gif", str(tmp_path / "a.gif"), "--mp4", str(tmp_path / "a.mp4"))
     assert main(["view", str(file), "--goal", GOAL, *films]) == 0
     assert "a.gif" in capsys.readouterr().err
-    unguided = ("--guide", "none", "--checkpoint", "geometry")
-    assert main(["view", str(file), "--goal", GOAL, *films, *unguided]) == 0
+    assert main(["view", str(file), "--goal", GOAL, *films, "--guide", "none"]) == 0

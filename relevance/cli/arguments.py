@@ -55,6 +55,18 @@ def over_zero(flag: str, value: float | None) -> None:
         raise UsageError(f"{flag} {value}: expected a number over 0")
 
 
+def check_file(flag: str, file: Path | None, ending: str) -> None:
+    """UsageError that names the flag, unless it is not given, or such a file can be written."""
+    if file is None:
+        return
+    if file.suffix.lower() != ending:
+        raise UsageError(f"{flag} {file}: expected a file that ends in {ending}")
+    if not file.parent.is_dir() or not os.access(file.parent, os.W_OK):
+        raise UsageError(f"{flag} {file}: {file.parent} is no folder that can be written")
+    if file.is_dir():
+        raise UsageError(f"{flag} {file}: is a folder, expected a file")
+
+
 def check_workers(workers: int) -> None:
     """UsageError unless that many processes can be had."""
     at_least("--workers", workers, 1, MOST_WORKERS)

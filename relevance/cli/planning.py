@@ -2,7 +2,6 @@
 
 # No `from __future__ import annotations`: tyro reads the annotations of local functions.
 import math
-import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ from relevance.cli.arguments import (
     Preset,
     Repeated,
     at_least,
+    check_file,
     one_of,
     settings_of,
 )
@@ -78,7 +78,7 @@ def _plan(_: Preset) -> Callable[..., int]:
         at_least("--max-actions", max_actions, 2)
         at_least("--seconds", seconds, 0.001)
         at_least("--beta", beta, -math.inf)
-        _check_trajectory(trajectory)
+        check_file("--trajectory", trajectory, ".npz")
         if coverage is not None and checkpoint is None:
             raise UsageError("--coverage needs a --guide and a --checkpoint")
         if GUIDES[guide].guided != (checkpoint is not None):
@@ -154,18 +154,6 @@ def plan_line(scene_id: str, result: Any) -> dict[str, Any]:
             "max_penetration": verdict.max_penetration,
         },
     }
-
-
-def _check_trajectory(file: Path | None) -> None:
-    """UsageError where no such file can be written."""
-    if file is None:
-        return
-    if file.suffix != ".npz":
-        raise UsageError(f"--trajectory {file}: expected a file that ends in .npz")
-    if not file.parent.is_dir() or not os.access(file.parent, os.W_OK):
-        raise UsageError(f"--trajectory {file}: {file.parent} is no folder that can be written")
-    if file.is_dir():
-        raise UsageError(f"--trajectory {file}: is a folder, expected a file")
 
 
 def _numbered(file: Path | None, count: int) -> list[Path | None]:

@@ -16,6 +16,7 @@ from relevance.cli.arguments import (
     OptionalPath,
     Preset,
     at_least,
+    check_file,
     one_of,
 )
 from relevance.cli.terminal import UsageError, bar, say
@@ -65,7 +66,11 @@ def _view(_: Preset) -> Callable[..., int]:
         at_least("--beta", beta, -math.inf)
         at_least("--max-actions", max_actions, 2)
         at_least("--port", port, 1, 65535)
-        films = _films(gif, mp4)
+        if checkpoint is not None and not GUIDES[guide].guided:
+            raise UsageError("--guide and --checkpoint go together: none asks no model")
+        for flag, file in (("gif", gif), ("mp4", mp4)):
+            check_file(f"--{flag}", file, f".{flag}")
+        films = [file for file in (gif, mp4) if file is not None]
         if not films:
             require_viser()
         if locate(place).is_file():
@@ -97,16 +102,6 @@ def _view(_: Preset) -> Callable[..., int]:
         return 0
 
     return view
-
-
-def _films(gif: Path | None, mp4: Path | None) -> list[Path]:
-    """The files to write; UsageError where one is called otherwise or cannot be written."""
-    for flag, file in (("gif", gif), ("mp4", mp4)):
-        if file is not None and file.suffix.lower() != f".{flag}":
-            raise UsageError(f"--{flag} {file}: expected a file that ends in .{flag}")
-        if file is not None and not file.parent.is_dir():
-            raise UsageError(f"--{flag} {file}: {file.parent} is no folder")
-    return [file for file in (gif, mp4) if file is not None]
 
 
 def _guide(dataset: Any, checkpoint: str | None, mode: str, beta: float) -> Any:
