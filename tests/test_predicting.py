@@ -93,6 +93,13 @@ def test_views_cut_from_the_picture(files: Files, capsys: pytest.CaptureFixture[
     cut = {row["object"]: row for row in predicted(capsys, files.image, *crops, *told)}
     read = predicted(capsys, files.image, "--views", files.views, *told)
     assert [cut[row["object"]] for row in read] == read
+    named = [*crops, "--crop=a=b=1,2,32,32", "--crop=\u00e9=5,6,32,32"]
+    names = {row["object"] for row in predicted(capsys, files.image, *named, *told)}
+    assert names == {*CROPS, "a=b", "\u00e9"}
+    assert (
+        main(["predict", str(files.image), *named, "--crop=e\u0301=1,2,3,4", "--goal", GOAL]) == 2
+    )
+    assert "expected each name once" in capsys.readouterr().err
     seen = look_at(files.image, crops={"red": (0, 0, 90, 50), "blue": (5, 5, 7, 9)})
     assert {view.shape for view in seen.views.values()} == {(32, 32, 3)}
 
@@ -140,7 +147,10 @@ def test_every_body_that_looks_can_be_asked(files: Files, tmp_path: Path) -> Non
         ({"checkpoint": "geometry.pt"}, "geometry-untrained: is told where objects are, expected"),
         ({"checkpoint": "text.png"}, "text.png: not a checkpoint"),
         ({"crop": "red=300,0,40,40"}, "crop red=300,0,40,40: expected left, top, width and height"),
-        ({"crop": "red=1,2,3"}, "--crop red=1,2,3: expected NAME=X,Y,W,H, each name once"),
+        ({"crop": "red=1,2,3"}, "--crop 'red=1,2,3': expected NAME=X,Y,W,H, in pixels"),
+        ({"crop": f"red={'9' * 5000},2,3,4"}, "99…: expected NAME=X,Y,W,H, in pixels"),
+        ({"crop": " red=1,2,3,4"}, "--crop ' red=1,2,3,4': name: expected no blanks at its ends"),
+        ({"crop": "a,b=1,2,3,4"}, "--crop 'a,b=1,2,3,4': name: expected none of"),
         ({"crop": "red=1,2,0,3"}, "crop red=1,2,0,3: expected left, top, width and height"),
         ({"out": "answer.xyz"}, "answer.xyz: cannot write .xyz, expected .png, .webp or .jpg"),
         ({"beta": "nan"}, "--beta nan: expected a finite number"),

@@ -12,7 +12,7 @@ import tyro
 from relevance.cli.arguments import Command, OptionalPath, Preset, Repeated, at_least
 from relevance.cli.terminal import Format, UsageError, say, show
 
-_CROP = re.compile(r"(?P<name>[^=]+)=(?P<box>\d+,\d+,\d+,\d+)")
+_CROP = re.compile(r"(?P<name>.+)=(?P<box>[0-9]{1,6}(,[0-9]{1,6}){3})")
 
 
 def _predict(_: Preset) -> Callable[..., int]:
@@ -45,15 +45,22 @@ def _predict(_: Preset) -> Callable[..., int]:
         from relevance.evaluation import load_scorer
         from relevance.evaluation.pictures import draw, judge, look_at
         from relevance.scene import Goal
+        from relevance.scene.words import named, shown
 
         at_least("--beta", beta, -math.inf)
         crops: dict[str, tuple[int, int, int, int]] = {}
         for text in crop:
             found = _CROP.fullmatch(text)
-            if found is None or found["name"] in crops:
-                raise UsageError(f"--crop {text}: expected NAME=X,Y,W,H, each name once")
+            if found is None:
+                raise UsageError(f"--crop {shown(text)}: expected NAME=X,Y,W,H, in pixels")
+            try:
+                name = named(found["name"])
+            except ValueError as error:
+                raise UsageError(f"--crop {shown(text)}: name: {error}") from None
+            if name in crops:
+                raise UsageError(f"--crop {shown(text)}: expected each name once")
             x, y, w, h = map(int, found["box"].split(","))
-            crops[found["name"]] = (x, y, w, h)
+            crops[name] = (x, y, w, h)
         goals = [Goal.parse(text) for text in goal]
         if not goals:
             raise UsageError("--goal: expected at least one")

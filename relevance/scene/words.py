@@ -41,7 +41,8 @@ def _word(text: str, also: str = "") -> str:
     return text
 
 
-def _name(text: str) -> str:
+def named(text: str) -> str:
+    """A name in its normal form; ValueError says why it can be none."""
     text = _word(text)
     if not text:
         raise ValueError("expected at least 1 character")
@@ -54,7 +55,7 @@ def _id(text: str) -> str:
     return _word(text, _LINES)
 
 
-Name = Annotated[str, AfterValidator(_name)]
+Name = Annotated[str, AfterValidator(named)]
 """A name of a box: goals are written with it."""
 Id = Annotated[str, AfterValidator(_id)]
 """An id of a scene; empty: not given."""
