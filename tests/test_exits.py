@@ -64,6 +64,20 @@ def _shell(command: str, **env: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize(
+    "locale",
+    [
+        {"PYTHONIOENCODING": "ascii"},
+        {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"},
+    ],
+)
+def test_what_a_locale_cannot_write_is_escaped(scene: Path, locale: dict[str, str]) -> None:
+    scene.write_text(scene.read_text().replace("top", "d\\u00e9j\\u00e0"))
+    done = _shell(f'"$R" plan "{scene}"', **locale)
+    assert done.returncode == 0, done.stderr
+    assert r"on(d\xe9j\xe0, blue): holds already" in done.stdout
+
+
+@pytest.mark.parametrize(
     "command",
     [
         '"$R" --help | true; exit ${PIPESTATUS[0]}',

@@ -170,7 +170,8 @@ def _tell_warnings(name: str) -> None:
 
 
 def _open_streams() -> None:
-    """Give a process that was started without a standard stream one that leads nowhere.
+    """Give a process that was started without a standard stream one that leads nowhere, and escape
+    what a locale cannot write.
 
     Else the next file that is opened would take its number, and get what is printed.
     """
@@ -180,6 +181,8 @@ def _open_streams() -> None:
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
             setattr(sys, name, os.fdopen(number, mode, closefd=False))
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _nobody_reads() -> bool:
