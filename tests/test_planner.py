@@ -211,6 +211,17 @@ def test_infeasible_goals_say_why():
     assert "goal region" in result.reason
 
 
+@pytest.mark.parametrize("search", ["tree", "informed"])
+def test_a_box_in_the_arm_where_it_begins_leaves_no_plan(search):
+    config = PlannerConfig(search=search)
+    pole = box("pole", -0.17, 0.0, size=(0.06, 0.06, 0.8))
+    result = plan(Scene(objects=(*OPEN.objects, pole)), "on(red, blue)", config=config)
+    assert (result.status, result.counts.nodes) == ("infeasible", 0)
+    assert result.reason == "pole stands where the arm is at first"
+    beside = box("pole", -0.17, 0.25, size=(0.06, 0.06, 0.8))
+    assert plan(Scene(objects=(*OPEN.objects, beside)), "on(red, blue)").status == "solved"
+
+
 def test_node_limit_is_a_status():
     result = plan(OPEN, "on-the-left(red, blue)", config=PlannerConfig(node_limit=1))
     assert result.status == "limit"

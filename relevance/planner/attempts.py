@@ -153,6 +153,9 @@ class Attempt(ABC):
     def hopeless(self) -> tuple[Status, str, tuple[str, ...]] | None:
         """Why no sequence can work even if everything else were gone; None if one might."""
         goal, problem = self.problem.goal, self.problem
+        if inside := self.bounds.path.in_the_arm:
+            names = f"{', '.join(inside)} {'stand' if len(inside) > 1 else 'stands'}"
+            return "infeasible", f"{names} where the arm is at first", ()
         if goal.subject not in self.allowed:
             return "infeasible", f"{goal.subject} may not be moved", (goal.subject,)
         if not self.pose.grasps(goal.subject):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +31,7 @@ from relevance.planner.kernels.motions import (
 from relevance.planner.logic import actions
 from relevance.planner.pose import Placement
 from relevance.planner.problem import Problem
-from relevance.robot import ARM, HOME
+from relevance.robot import ARM, HOME, panda
 from relevance.scene import Phase, Pose
 from relevance.scene.geometry import upright
 
@@ -78,6 +79,21 @@ class PathBound:
         self.problem = problem
         self._suspect: tuple[str, bool] | None = None
         """The leg that failed last, which is tried first: it mostly fails again."""
+
+    @cached_property
+    def in_the_arm(self) -> tuple[str, ...]:
+        """Boxes that the arm is in where every plan begins, its hand open or shut."""
+        problem, X, found = self.problem, np.tile(HOME, (2, 1)), []
+        for name in problem.boxes if problem.tall else ():
+            box = problem.obstacles[problem.index[name]][None]
+            depths = []
+            for opening in (0.0, panda().max_opening):
+                body = bodies(opening)
+                margin, over = np.zeros((len(body.link), 1)), np.zeros((1, 2))
+                depths.append(dense_check(X, problem.arm, body, box, box, margin, over))
+            if max(min(depths), upper_depth(problem, X, box)) > ALLOWED:
+                found.append(name)
+        return tuple(found)
 
     def solve(
         self,
