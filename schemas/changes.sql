@@ -136,7 +136,8 @@ by_query AS (
     GROUP BY ALL
 )
 SELECT
-    g.family, g.planner_before, g.planner_now, g.config_before, goals, newly_solved, no_longer_solved, never_solved,
+    g.family, g.planner_before, g.planner_now, g.config_before,
+    goals, newly_solved, no_longer_solved, never_solved,
     same_boxes_moved, fewer_boxes_moved, more_boxes_moved, other_boxes_moved,
     coalesce(queries, 0) AS queries, coalesce(equal, 0) AS equal,
     coalesce(to_irrelevant, 0) AS to_irrelevant, coalesce(to_relevant, 0) AS to_relevant

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -66,11 +67,14 @@ def template(table: str, of: Labelling | None) -> str:
 
 def is_named(table: str, of: Labelling | None, within: Path) -> bool:
     """Whether a file's way within a dataset is one that the table's template leads to."""
-    pattern = "".join(
-        r"\d{6,}" if part == "{shard:06d}" else "[^/.][^/]*" if part[:1] == "{" else re.escape(part)
-        for part in re.split(r"({[^}]*})", template(table, of))
-    )
-    return re.fullmatch(pattern, within.as_posix()) is not None
+    return _ways(table, of).fullmatch(within.as_posix()) is not None
+
+
+@cache
+def _ways(table: str, of: Labelling | None) -> re.Pattern[str]:
+    number, key = re.escape("{shard:06d}"), r"\\{\w+\\}"
+    fixed = re.escape(template(table, of)).replace(number, r"\d{6,}")
+    return re.compile(re.sub(key, "[^/.][^/]*", fixed))
 
 
 def folder(table: str, of: Labelling | None) -> str:

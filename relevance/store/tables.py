@@ -56,8 +56,6 @@ class TableSchema:
     """Where files of another `Labelling` than the current one lie; empty when they do not."""
     sharded: bool = False
     """Made by generating and labelling, shard by shard; a merged dataset refers to it."""
-    clock: bool = False
-    """Holds times: outside the promise of equal bytes."""
     gathered: tuple[str, ...] = ()
     """The flags by which `compact` gathers it; empty when it does not."""
     exported: str = ""
