@@ -72,6 +72,17 @@ def test_what_is_sunk_into_its_neighbours_leaves_them_without_going_deeper(goal)
     assert penetration(scene, result) <= 1e-3
 
 
+@pytest.mark.parametrize("goal", ["on-the-left(a, r)", "on(r, a)", "in-front(b, r)"])
+def test_what_is_sunk_into_what_it_stands_on_is_lifted_out(goal):
+    deep = 0.95e-3
+    a, r = (box(name, 0.0, y, bottom=-deep) for name, y in (("a", 0.1), ("r", -0.1)))
+    b = box("b", 0.0, 0.1, BLUE, bottom=a.top - deep, on="a")
+    result = plan(Scene(objects=(a, r, b)), goal)
+    assert result.status == "solved", result.reason
+    assert result.replay is not None
+    assert result.replay.ok
+
+
 def test_dense_check_of_the_plan_alone_equals_the_solvers(planned):
     for scene, _, result in planned:
         if result.status == "solved":

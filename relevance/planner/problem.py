@@ -24,6 +24,8 @@ from relevance.scene.geometry import UPRIGHT, upright
 
 LOW = 0.2
 """Height over the robot's base below which only the hand and the forearm can be, m."""
+ROUNDING = 1e-9
+"""A box that is sunk less into what carries it stands on it, m."""
 CLOSE = 2e-4
 """A decision that turns over when something stands this much elsewhere is a close one, m."""
 
@@ -91,15 +93,30 @@ class Problem:
                 found.setdefault(i, {})[k] = found.setdefault(k, {})[i] = sunk
         return found
 
+    @cached_property
+    def _sunk_under(self) -> dict[int, dict[int, float]]:
+        """The same of what boxes stand on, the table too."""
+        found: dict[int, dict[int, float]] = {}
+        for i, box in enumerate(self.scene.objects):
+            for k in [self.index[name] for name in box.supports] or [len(self.boxes)]:
+                sunk = self.obstacles[k, 2] + self.obstacles[k, 6] - box.bottom
+                if sunk > ROUNDING:
+                    found.setdefault(i, {})[k] = sunk
+        return found
+
     def beside(self, i: int, obstacles: np.ndarray) -> np.ndarray:
         """Obstacles as box i meets them while it rises from where it stood at first: what it is
-        sunk into and still stands there is shrunk, so that they only touch."""
+        sunk into and still stands there is shrunk or lowered, so that they only touch."""
         rows = obstacles.copy()
         for k, sunk in self._sunk.get(i, {}).items():
             if (rows[k] == self.obstacles[k]).all():
                 x, y, z, yaw, hx, hy, hz = rows[k, :7]
                 hx, hy = max(hx - sunk, 1e-4), max(hy - sunk, 1e-4)
                 upright(x, y, z, yaw, hx, hy, hz, rows[k])
+        for k, sunk in self._sunk_under.get(i, {}).items():
+            if (rows[k] == self.obstacles[k]).all():
+                x, y, z, yaw, hx, hy, hz = rows[k, :7]
+                upright(x, y, z - sunk, yaw, hx, hy, hz, rows[k])
         return rows
 
     def _fixtures(self) -> list[np.ndarray]:
