@@ -8,7 +8,7 @@ import pytest
 
 from relevance.benchmarks.reference import CLEARANCE, shortest
 from relevance.planner import PlannerConfig, penetration, plan
-from relevance.scene import PREDICATES, Box, Scene, SceneError, Table, goal_holds
+from relevance.scene import PREDICATES, Box, Robot, Scene, SceneError, Table, goal_holds
 from relevance.simulation import replay
 from tests.planning import BLUE, GREEN, GREY, OPEN, RED, box, tasks
 
@@ -81,6 +81,62 @@ def test_what_is_sunk_into_what_it_stands_on_is_lifted_out(goal):
     assert result.status == "solved", result.reason
     assert result.replay is not None
     assert result.replay.ok
+
+
+def test_what_is_sunk_into_a_box_beside_its_support_is_lifted_out():
+    deep = 0.95e-3
+    support = box("s", 0.0, 0.2, size=(0.06, 0.06, 0.06 - deep))
+    plank = box("p", 0.0, 0.22, RED, size=(0.05, 0.2, 0.03), bottom=support.top, on="s")
+    scene = Scene(objects=(box("r", 0.0, -0.15, BLUE), support, box("c", 0.0, 0.28), plank))
+    assert plan(scene, "on-the-left(p, r)").status == "solved"
+
+
+@pytest.mark.parametrize("above", [0.0, 5e-4, -9e-4])
+def test_low_boxes_are_taken_off_a_wide_one(above):
+    """The tips keep their distance from what the box stands on, whatever rounding says."""
+    tray = box("p", 0.0, 0.0, size=(0.1, 0.1, 0.03))
+    low = box("a", 0.0, 0.0, RED, size=(0.04, 0.05, 0.011), bottom=0.03 + above, on="p")
+    result = plan(Scene(objects=(tray, low, box("r", -0.05, 0.3, BLUE))), "on(a, r)")
+    assert result.status == "solved", result.reason
+    assert result.replay is not None
+    assert result.replay.ok
+
+
+@pytest.mark.parametrize("turn", [0.0, math.pi / 24, math.pi / 12])
+def test_a_narrow_slot_is_found_however_it_is_turned(turn):
+    c, s = math.cos(turn), math.sin(turn)
+    boxes = (
+        box("a", 0.0, 0.3, RED),
+        box("r", 0.0, 0.0, BLUE, size=(0.12, 0.1, 0.03)),
+        *(box(f"w{x}", x, -0.12, size=(0.2, 0.12, 0.03)) for x in (0.129, -0.129)),
+    )
+    turned = tuple(
+        replace(it, position=(c * x - s * y, s * x + c * y, z), yaw=turn)
+        for it in boxes
+        for x, y, z in [it.position]
+    )
+    robot = Robot(base=(-0.48 * c, -0.48 * s, 0.0), yaw=turn)
+    scene = Scene(objects=turned, table=Table(size=(3.0, 3.0)), robot=robot)
+    assert plan(scene, "on-the-right(a, r)", movable=["a"]).status == "solved"
+
+
+def test_a_plan_found_before_the_node_limit_counts():
+    stack = [box("s0", 0.0, 0.0, RED)]
+    for below in ("s0", "s1"):
+        stack.append(box(f"s{len(stack)}", 0.0, 0.0, bottom=stack[-1].top, on=below))
+    others = (box(f"o{i}", 0.0, y, BLUE) for i, y in enumerate((-0.3, -0.15, 0.15, 0.3)))
+    scene = Scene(objects=(*stack, *others))
+
+    def found(stop, limit=20_000):
+        config = PlannerConfig(search="tree", stop=stop, node_limit=limit)
+        return plan(scene, "on(s0, o0)", config=config, replay=False)
+
+    first, level = found("first"), found("level")
+    assert level.counts.nodes > first.counts.nodes
+    cut = found("level", first.counts.nodes)
+    assert (cut.status, cut.moved) == ("solved", first.moved)
+    assert cut.ambiguous
+    assert not level.ambiguous
 
 
 def test_dense_check_of_the_plan_alone_equals_the_solvers(planned):

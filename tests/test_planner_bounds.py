@@ -383,7 +383,7 @@ def test_pose_bound_never_refuses_what_a_grid_finds(seed):
         at = np.zeros(4)
         reach = np.array([[0.0, near, far, 0.0, planar.ANY_TURN]])
         common = (0.0, grasp.parts[None], obstacles, table, BASE, reach)
-        status, _ = planar.find_pose(region, np.zeros(2), *common, 0.0, at)
+        status, _ = planar.find_pose(region, np.zeros(2), *common, 0.0, 0.0, at)
         c, s = math.cos(0.2), math.sin(0.2)
         grid = max(
             planar.slack(c * x - s * y, s * x + c * y, angle, *common, 0.0)[0]

@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from relevance.holding.hand import MARGIN, PICK_MARGIN
+from relevance.scene.contacts import CONTACT_TOLERANCE
 from relevance.scene.geometry import rectangle_gap
 
 HAND_REACH = 0.2
@@ -40,8 +41,9 @@ def pick_gaps(i, axes, parts, obstacles, room, most, gaps):
         other = obstacles[k : k + 1]
         dx, dy = o[0] - other[0, 0], o[1] - other[0, 1]
         apart = math.sqrt(dx * dx + dy * dy) - o[7] - other[0, 7]
-        under = other[0, 2] + other[0, 6] - bottom - lowest <= -MARGIN
-        if k == i or apart > HAND_REACH or under:
+        rise = other[0, 2] + other[0, 6] - bottom
+        # the tips keep GROUND from what it stands on, also where it is sunk into that
+        if k == i or apart > HAND_REACH or rise <= max(lowest - MARGIN, CONTACT_TOLERANCE):
             continue
         for g in range(len(axes)):
             angle = o[3] + axes[g] * math.pi / 2

@@ -96,7 +96,8 @@ def unframe(path: Path, kind: str, version: int) -> bytes:
     try:
         content = path.read_bytes()
     except FileNotFoundError:
-        raise CheckpointError(f"{path}: no such file, {wanted}") from None
+        models = f" or one of {', '.join(shipped())}" if kind == "checkpoint" else ""
+        raise CheckpointError(f"{path}: no such file, {wanted}{models}") from None
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror}), {wanted}") from None
     line, _, body = content.partition(b"\n")

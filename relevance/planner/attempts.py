@@ -32,7 +32,7 @@ ORDERS = 6
 COST_TOLERANCE = 1e-3
 """Costs are compared after rounding to this, rad^2."""
 
-Turns = Generator[None, None, list[Motion]]
+Turns = Generator[None, None, None]
 """A search that pauses after every set, so that another may take its turn."""
 
 
@@ -76,6 +76,8 @@ class Attempt(ABC):
         """Nodes that it may still open."""
         self.exhausted = True
         """Whether the search ended by itself, not at its limit."""
+        self.found = list[Motion]()
+        """The plans among which the best is chosen; at its limit, of those so far."""
         self.refused_late = False
         self._staying = dict[str, bool]()
         self.late = False
@@ -84,8 +86,8 @@ class Attempt(ABC):
         """Whether plans of more actions than allowed were left untried."""
 
     @abstractmethod
-    def _plans(self) -> Turns:
-        """The plans among which the best is chosen."""
+    def _search(self) -> Turns:
+        """Fill `found`."""
 
     def run(self) -> PlanResult:
         """The result, in one go."""
@@ -99,11 +101,10 @@ class Attempt(ABC):
     def turns(self) -> Generator[None, None, PlanResult]:
         """The result, with pauses."""
         try:
-            found = yield from self._plans()
+            yield from self._search()
         except _Limit:
             self.exhausted = False
-            found = []
-        return self._solved(found) if found else self._unsolved()
+        return self._solved(self.found) if self.found else self._unsolved()
 
     def _unsolved(self) -> PlanResult:
         """There is no plan: why."""
@@ -137,7 +138,7 @@ class Attempt(ABC):
             alternatives=tuple(motion.order for motion in found),
             final=best.final,
             cost=best.cost,
-            ambiguous=problem.undecided or self.refused_late or len(sets) > 1,
+            ambiguous=problem.undecided or self.refused_late or len(sets) > 1 or not self.exhausted,
             counts=problem.counts,
             check_ok=True,
             max_penetration=best.max_penetration,

@@ -15,48 +15,46 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 
 from relevance.planner.attempts import LOOK, Attempt, Turns
-from relevance.planner.path import Motion
 
 
 class Levels(Attempt):
     """Breadth-first over sequences or sets of moved objects."""
 
-    def _plans(self) -> Turns:
+    def _search(self) -> Turns:
         """All plans of the first level that has one.
 
         The reference is a landmark: sequences that move it count only when no other does it.
         """
         if self.hopeless is not None:
-            return []
-        reference, found = self.problem.goal.reference, list[Motion]()
+            return
+        reference = self.problem.goal.reference
         levels = self._sequences if self.config.search == "tree" else self._sets
         if self._within_reach():
-            found = yield from levels(
-                [name for name in self.order if name != reference], frozenset()
-            )
-        if not found and self._reference_moves():
-            found = yield from levels(self.order, frozenset({reference}))
-        return found
+            yield from levels([name for name in self.order if name != reference], frozenset())
+        if not self.found and self._reference_moves():
+            yield from levels(self.order, frozenset({reference}))
 
     def _sequences(self, movable: list[str], required: frozenset[str]) -> Turns:
         """Breadth-first over sequences of objects moved before the subject."""
         subject = self.problem.goal.subject
         frontier: list[tuple[str, ...]] = [()]
         for level in range(self.config.max_actions // 2):
-            found, following = [], []
+            following = list[tuple[str, ...]]()
             if level == LOOK:
                 movable = self._leaving(movable)
                 if not (required or self._works(frozenset(movable))):
-                    return []
+                    return
             for prefix in frontier:
                 self._visit()
                 if required <= set(prefix) and self._passes(frozenset(prefix)):
                     motion = yield from self._motion([prefix])
                     if motion is not None:
-                        found.append(motion)
+                        self.found.append(motion)
                         if self.config.stop == "first":
-                            return found
+                            return
                 yield
+                if self.found:
+                    continue
                 if not prefix:
                     movable = [name for name in movable if not self._stays(name)]
                 for name in movable:
@@ -66,13 +64,12 @@ class Levels(Attempt):
                     if self.pose.pickable(name, frozenset(prefix)):
                         self._visit()
                         following.append((*prefix, name))
-            if found:
-                return found
+            if self.found:
+                return
             frontier = following
             if not frontier:
                 break
         self.cut |= bool(frontier)
-        return []
 
     def _sets(self, movable: list[str], required: frozenset[str]) -> Turns:
         """Breadth-first over sets of objects moved before the subject. A set grows by what blocks
@@ -86,27 +83,27 @@ class Levels(Attempt):
             return name in rank and not self._stays(name)
 
         for level in range(self.config.max_actions // 2):
-            found, tried = [], list[tuple[frozenset[str], frozenset[str], bool]]()
+            tried = list[tuple[frozenset[str], frozenset[str], bool]]()
             if level == LOOK:
                 leaving = frozenset(self._leaving(list(rank)))
                 if not (required or self._works(leaving)):
-                    return []
+                    return
                 rank = {name: i for name, i in rank.items() if name in leaving}
                 frontier = [chosen for chosen in frontier if chosen <= leaving]
                 rest = [chosen for chosen in rest if chosen <= leaving]
-            for chosen in self._tiers(frontier, rest, found):
+            for chosen in self._tiers(frontier, rest):
                 self._visit()
                 self.late, open_picks = False, self._open_picks(chosen)
                 if required <= chosen and not open_picks and self._passes(chosen):
                     motion = yield from self._motion(self._orders(chosen))
                     if motion is not None:
-                        found.append(motion)
+                        self.found.append(motion)
                         if self.config.stop == "first":
-                            return found
+                            return
                 tried.append((chosen, open_picks, self.late))
                 yield
-            if found:
-                return found
+            if self.found:
+                return
             following, others = set(), set()
             for chosen, open_picks, late in tried:
                 # Whatever else leaves, one of these is among it.
@@ -121,14 +118,13 @@ class Levels(Attempt):
             if not (frontier or rest):
                 break
         self.cut |= bool(frontier or rest)
-        return []
 
     def _tiers(
-        self, first: list[frozenset[str]], rest: list[frozenset[str]], found: list[Motion]
+        self, first: list[frozenset[str]], rest: list[frozenset[str]]
     ) -> Iterator[frozenset[str]]:
         """The likely sets of a level, and the rest where none of them has given a plan."""
         yield from first
-        if not found:
+        if not self.found:
             yield from rest
 
 

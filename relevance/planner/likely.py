@@ -13,7 +13,7 @@ whatever leaves only makes room.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from heapq import heappop, heappush
@@ -120,28 +120,28 @@ class Likely(Attempt):
         self._pushed += 1
         heappush(self._heap, (key, isinstance(item, _Growth), self._pushed, item))
 
-    def _plans(self) -> Turns:
+    def _search(self) -> Turns:
         """The first plan; with `shortest` and whole levels all that are as short."""
-        found, until = list[Motion](), ()
+        until = ()
         if self.problem.goal.subject not in self.allowed:
-            return found
+            return
         self._add(_Set(chosen=frozenset(), cost=0.0))
         while self._heap:
             key, _, _, item = heappop(self._heap)
-            if found and key[:-1] > until:
+            if self.found and key[:-1] > until:
                 break
             if isinstance(item, _Growth):
                 self._grow(item)
             elif motions := (yield from self._test(item.chosen)):
-                found, until = found + motions, key[:-1]
+                until = key[:-1]
+                self.found += motions
                 if not self.shortest or self.config.stop == "first":
                     break
             elif self.late:  # the others' leaving can make room for what is put aside
                 self._open(_Growth(of=item, by=self._others(item.chosen), rest=True, sifted=True))
             yield
-        if not found:
+        if not self.found:
             self.cut = any(self._can_grow(chosen) for chosen in self._deepest)
-        return found
 
     def _add(self, item: _Set, *, rest: bool = False) -> None:
         """A set's turn to be tested, and to grow."""
@@ -208,7 +208,7 @@ class Likely(Attempt):
         names = self._helpful(chosen, self._others(chosen))
         return any(self._can_move(name, chosen) for name in names)
 
-    def _test(self, chosen: frozenset[str]) -> Turns:
+    def _test(self, chosen: frozenset[str]) -> Generator[None, None, list[Motion]]:
         """The plans that move a set and then the subject."""
         self.late = False
         moves = self.problem.goal.reference in chosen

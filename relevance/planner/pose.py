@@ -49,6 +49,9 @@ ELSEWHERE = ((0.0, 0.3), (0.0, -0.3))
 (x, y), m."""
 FAMILIES = (deep_grasps, other_grasps, leaning_grasps)
 """The grasps of a box, the preferred first."""
+TURNS = (0.0, math.pi / 12, math.pi / 24, math.pi / 8)
+"""At which angle a search for a pose begins, and begins again where it could not decide: in a narrow
+slot the only angle may be at the edge of the first cells (along the axes it is), rad."""
 SKY = 2.0
 """Height up to which the hand and what is above it count as an obstacle, m."""
 
@@ -334,7 +337,13 @@ class PoseBound:
         table, at = problem.table, problem.arm.base
 
         def find(ease: float) -> tuple[int, float]:
-            return find_pose(area, prefer, bottom, parts, obstacles, table, at, reach, ease, pose)
+            status, spare = UNDECIDED, 0.0
+            for turn in TURNS:
+                if status == UNDECIDED:
+                    status, spare = find_pose(
+                        area, prefer, bottom, parts, obstacles, table, at, reach, ease, turn, pose
+                    )
+            return status, spare
 
         status, spare = find(0.0)
         found = None
@@ -368,7 +377,7 @@ class PoseBound:
             reach = np.array([[0.0, 0.0, SKY, 0.0, ANY_TURN]])
             table, at, pose = self.problem.table, self.problem.arm.base, np.zeros(4)
             status, _ = find_pose(
-                area, area[:2], bottom, alone, obstacles, table, at, reach, CLOSE, pose
+                area, area[:2], bottom, alone, obstacles, table, at, reach, CLOSE, TURNS[0], pose
             )
             self._rooms[key] = status != NONE
         return self._rooms[key]

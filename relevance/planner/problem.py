@@ -19,13 +19,13 @@ from relevance.planner import logic
 from relevance.planner.kernels.kinematics import Arm, arm_at
 from relevance.planner.result import Counts, Seconds
 from relevance.robot import panda
-from relevance.scene import Box, Goal, Rectangle, Scene, footprint_gap
+from relevance.scene import CONTACT_TOLERANCE, Box, Goal, Rectangle, Scene, footprint_gap
 from relevance.scene.geometry import UPRIGHT, upright
 
 LOW = 0.2
 """Height over the robot's base below which only the hand and the forearm can be, m."""
 ROUNDING = 1e-9
-"""A box that is sunk less into what carries it stands on it, m."""
+"""A box that is sunk less into what is below it stands on that, m."""
 CLOSE = 2e-4
 """A decision that turns over when something stands this much elsewhere is a close one, m."""
 
@@ -95,13 +95,15 @@ class Problem:
 
     @cached_property
     def _sunk_under(self) -> dict[int, dict[int, float]]:
-        """The same of what boxes stand on, the table too."""
+        """How deep boxes are sunk into what is below them, the table too, m."""
+        count = len(self.boxes)
         found: dict[int, dict[int, float]] = {}
+        tops = self.obstacles[: count + 1, 2] + self.obstacles[: count + 1, 6]
         for i, box in enumerate(self.scene.objects):
-            for k in [self.index[name] for name in box.supports] or [len(self.boxes)]:
-                sunk = self.obstacles[k, 2] + self.obstacles[k, 6] - box.bottom
-                if sunk > ROUNDING:
-                    found.setdefault(i, {})[k] = sunk
+            deep = tops - box.bottom
+            for k in np.flatnonzero((deep > ROUNDING) & (deep <= CONTACT_TOLERANCE)).tolist():
+                if k == count or footprint_gap(box, self.scene.objects[k]) < 0:
+                    found.setdefault(i, {})[k] = float(deep[k])
         return found
 
     def beside(self, i: int, obstacles: np.ndarray) -> np.ndarray:

@@ -35,8 +35,8 @@ class PlannerConfig:
     max_actions: Annotated[int, Field(ge=2, multiple_of=2)] = 6
     node_limit: Annotated[int, Field(ge=1)] = 20_000
     stop: Literal["first", "level"] = "level"
-    """Whether the first plan counts, or the cheapest of all plans that are as short; guides that go
-    by the likeliest stop at the first in any case."""
+    """Whether the first plan counts, or the cheapest of all plans that are as short (at the node
+    limit of those so far); guides that go by the likeliest stop at the first in any case."""
 
 
 @dataclass(slots=True, kw_only=True)

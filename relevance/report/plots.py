@@ -314,7 +314,8 @@ def runtimes(*axes: Axes, comparisons: dict[str, list[Comparison]]) -> None:
         ax.set_xticks(range(len(ticks)), ticks)
         ax.set_title(label)
         ax.grid(axis="x", visible=False)
-    time_ax.legend()
+    handles, labels = time_ax.get_legend_handles_labels()
+    time_ax.figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     time_ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: seconds(value)))
 
 

@@ -120,11 +120,12 @@ def near_base(region, base):
 
 
 @njit(cache=True)
-def find_pose(region, prefer, bottom, parts, obstacles, table, base, reach, ease, pose):
+def find_pose(region, prefer, bottom, parts, obstacles, table, base, reach, ease, turn, pose):
     """Branch and bound for a free pose whose centre lies in a rectangle.
 
     region: centre x, y, angle, half extents (5,). prefer (x, y): where to look first. parts,
-    reach: as `slack` has them. ease: how much every constraint is relaxed, m. Fills pose
+    reach: as `slack` has them. ease: how much every constraint is relaxed, m. turn: angle at which
+    the cells begin, rad. Fills pose
     (x, y, angle of the finger axis, which of the parts) with the first comfortable pose of the
     coarsest level that has a free one, or the clearest of that level.
     Returns (FOUND | NONE | UNDECIDED, the slack of the best pose seen, m).
@@ -160,7 +161,7 @@ def find_pose(region, prefer, bottom, parts, obstacles, table, base, reach, ease
         at = order[n // na]
         cells[n, 0] = -a + (2 * (at // ny) + 1) * hx
         cells[n, 1] = -b + (2 * (at % ny) + 1) * hy
-        cells[n, 2] = (2 * (n % na) + 1) * ha
+        cells[n, 2] = turn + (2 * (n % na) + 1) * ha
     evaluations = 0
     for level in range(MAX_LEVEL + 1):
         lipschitz = math.sqrt(hx * hx + hy * hy) + spin * ha
