@@ -50,8 +50,8 @@ ELSEWHERE = ((0.0, 0.3), (0.0, -0.3))
 FAMILIES = (deep_grasps, other_grasps, leaning_grasps)
 """The grasps of a box, the preferred first."""
 TURNS = (0.0, math.pi / 12, math.pi / 24, math.pi / 8)
-"""At which angle a search for a pose begins, and begins again where it could not decide: in a narrow
-slot the only angle may be at the edge of the first cells (along the axes it is), rad."""
+"""Angles at which a search for a pose begins, the next where it could not decide: in a narrow slot
+the only angle may be at the edge of the first cells (along the axes it is), rad."""
 SKY = 2.0
 """Height up to which the hand and what is above it count as an obstacle, m."""
 
