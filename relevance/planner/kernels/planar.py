@@ -125,9 +125,8 @@ def find_pose(region, prefer, bottom, parts, obstacles, table, base, reach, ease
 
     region: centre x, y, angle, half extents (5,). prefer (x, y): where to look first. parts,
     reach: as `slack` has them. ease: how much every constraint is relaxed, m. turn: angle at which
-    the cells begin, rad. Fills pose
-    (x, y, angle of the finger axis, which of the parts) with the first comfortable pose of the
-    coarsest level that has a free one, or the clearest of that level.
+    the cells begin, rad. Fills pose (x, y, angle of the finger axis, which of the parts) with the
+    first comfortable pose of the coarsest level that has a free one, or the clearest of that level.
     Returns (FOUND | NONE | UNDECIDED, the slack of the best pose seen, m).
     """
     region = near_base(region, base)  # the cells are as many as the region is large
