@@ -102,6 +102,17 @@ def test_low_boxes_are_taken_off_a_wide_one(above):
     assert result.replay.ok
 
 
+@pytest.mark.parametrize("movable", [None, ["a"]])
+def test_a_box_is_put_behind_a_pole_that_stays(movable):
+    """By the first poses that are free the arm does not reach around it."""
+    pole = box("r", 0.0, 0.0, BLUE, size=(0.06, 0.06, 0.2))
+    scene = Scene(objects=(box("a", -0.15, -0.3, RED), pole))
+    result = plan(scene, "behind(a, r)", movable=movable)
+    assert (result.status, result.moved) == ("solved", ("a",))
+    assert result.replay is not None
+    assert result.replay.ok
+
+
 @pytest.mark.parametrize("turn", [0.0, math.pi / 24, math.pi / 12])
 def test_a_narrow_slot_is_found_however_it_is_turned(turn):
     c, s = math.cos(turn), math.sin(turn)

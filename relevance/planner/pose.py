@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, compress, islice
+from itertools import chain, compress, islice, product
 from typing import NamedTuple
 
 import numpy as np
@@ -200,6 +200,21 @@ class PoseBound:
                 if rest := tuple(grasp for grasp in choice if _side(grasp) != side):
                     again.append((rest, number, area))
 
+    def _corner_poses(self, reference: Box) -> Iterator[Placement]:
+        """Free poses of the subject in the corners of the goal region, by every grasp, while all
+        others stand: beside something tall later bounds may refuse what `goal_poses` has."""
+        subject, gone = self.problem.subject, frozenset[str]()
+        bottom = reference.top if self.problem.goal.predicate.stacked else 0.0
+        standing = self.problem.standing({subject.name, reference.name})
+        obstacles = np.vstack([standing, obstacle(reference)])
+        choices = tuple(self.choices(subject.name, gone))
+        for area in self.problem.goal_regions(reference):
+            for corner in _corners(area):
+                for choice in choices:
+                    found = self._find(corner, corner[:2], bottom, subject, choice, obstacles)
+                    if found is not None:
+                        yield found
+
     def place_all(self, order: tuple[str, ...], tries: int = 8) -> Iterator[list[Placement]]:
         """Poses for every moved box: first the subject's, then the others' around it.
 
@@ -210,6 +225,8 @@ class PoseBound:
         if frozenset(order) - {self.problem.goal.subject, self.problem.goal.reference}:
             for aside in ELSEWHERE:
                 yield from self._arrangements(order, aside, 1)
+        elif len(order) == 1:
+            yield from ([place] for place in self._corner_poses(self.problem.reference))
 
     def _arrangements(
         self, order: tuple[str, ...], aside: tuple[float, float] | None, tries: int
@@ -514,6 +531,15 @@ class PoseBound:
             pose = (*box.position[:2], angle)
             found.append(volumes(grasp.parts, pose, box.bottom, 0.0, SKY)[1:])
         return found
+
+
+def _corners(area: np.ndarray) -> list[np.ndarray]:
+    """The corners of an area (5,): four rectangles of a third of its edges."""
+    x, y, turn, a, b = area
+    c, s, found = math.cos(turn), math.sin(turn), list[np.ndarray]()
+    for u, v in product((-2 * a / 3, 2 * a / 3), (-2 * b / 3, 2 * b / 3)):
+        found.append(np.array([x + c * u - s * v, y + s * u + c * v, turn, a / 3, b / 3]))
+    return found
 
 
 def _wrapped(angle: float) -> float:

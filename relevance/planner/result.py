@@ -22,7 +22,7 @@ from relevance.scene.words import normal, shown
 if TYPE_CHECKING:  # it imports pybullet, which planning does without
     from relevance.simulation import Replay
 
-PLANNER_VERSION = "9"
+PLANNER_VERSION = "10"
 Status = Literal["solved", "infeasible", "limit", "refused"]
 """`refused`: a plan was found, and the replay in the simulator does not confirm it."""
 
