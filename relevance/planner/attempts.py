@@ -104,7 +104,7 @@ class Attempt(ABC):
             yield from self._search()
         except _Limit:
             self.exhausted = False
-        return self._solved(self.found) if self.found else self._unsolved()
+        return self._solved() if self.found else self._unsolved()
 
     def _unsolved(self) -> PlanResult:
         """There is no plan: why."""
@@ -124,10 +124,10 @@ class Attempt(ABC):
             seconds=problem.seconds,
         )  # fmt: skip
 
-    def _solved(self, found: list[Motion]) -> PlanResult:
-        """The best of some plans."""
+    def _solved(self) -> PlanResult:
+        """The best of the plans."""
         problem, goal = self.problem, self.problem.goal
-        found.sort(key=self._rank)
+        found = sorted(self.found, key=self._rank)
         best = found[0]
         sets = {frozenset(motion.order) for motion in found}
         return PlanResult(

@@ -356,10 +356,11 @@ class PoseBound:
         def find(ease: float) -> tuple[int, float]:
             status, spare = UNDECIDED, 0.0
             for turn in TURNS:
-                if status == UNDECIDED:
-                    status, spare = find_pose(
-                        area, prefer, bottom, parts, obstacles, table, at, reach, ease, turn, pose
-                    )
+                status, spare = find_pose(
+                    area, prefer, bottom, parts, obstacles, table, at, reach, ease, turn, pose
+                )
+                if status != UNDECIDED:
+                    break
             return status, spare
 
         status, spare = find(0.0)

@@ -20,18 +20,12 @@ from relevance.report.style import (
     TIMES,
     VIOLET,
     family_color,
+    legend_below,
 )
 
 
 def _percent(axis: Any) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{round(100 * value, 2):g}%"))
-
-
-def _legend_below(ax: Axes) -> None:
-    """One legend under all panels, in a row."""
-    handles, labels = ax.get_legend_handles_labels()
-    room: dict[str, Any] = {"columnspacing": 1.0, "handletextpad": 0.3}
-    ax.figure.legend(handles, labels, loc="outside lower center", ncols=4, **room)
 
 
 def visibility(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -94,7 +88,7 @@ def by_part(ax: Axes, rows: Sequence[Mapping[str, Any]], by: str, title: str) ->
     ax.set_xlim(-0.02, 1.02)
     ax.grid(axis="y", visible=False)
     ax.set_title(title)
-    _legend_below(ax)
+    legend_below(ax, columnspacing=1.0, handletextpad=0.3)
     _percent(ax.xaxis)
 
 
@@ -124,7 +118,7 @@ def bodies(*axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
         _percent(ax.xaxis)
     for ax in axes[len(families) :]:
         ax.set_axis_off()
-    _legend_below(axes[0])
+    legend_below(axes[0], columnspacing=1.0, handletextpad=0.3)
 
 
 def keeping(ax: Axes, curve: Sequence[Mapping[str, float]], now: Mapping[str, float]) -> None:

@@ -20,6 +20,7 @@ from relevance.report.style import (
     ROSE,
     TEAL,
     VIOLET,
+    legend_below,
 )
 
 COLORS = (BLUE, ORANGE, GREEN, VIOLET, TEAL, ROSE, INK, GREY)
@@ -61,7 +62,7 @@ def learning(*axes: Axes, rows: Sequence[Row]) -> None:
     for ax in axes:
         ax.set_xlabel("minutes of a core")
         ax.set_xlim(left=0)
-    _legend_below(loss)
+    legend_below(loss)
 
 
 def _line(
@@ -119,11 +120,4 @@ def data(*axes: Axes, rows: Sequence[Row], by: str, title: str) -> None:
         ax.set_ylim(bottom=max(base, low) - 0.01)
         ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{round(100 * value, 2):g}%"))
     axes[0].set_ylabel("test queries judged rightly")
-    _legend_below(axes[0])
-
-
-def _legend_below(ax: Axes) -> None:
-    """One legend under all panels, in rows."""
-    handles, labels = ax.get_legend_handles_labels()
-    columns = min(4, max(1, len(labels)))
-    ax.figure.legend(handles, labels, loc="outside lower center", ncols=columns)
+    legend_below(axes[0])

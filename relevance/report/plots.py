@@ -38,6 +38,7 @@ from relevance.report.style import (
     VIOLET,
     family_color,
     guide_style,
+    legend_below,
     pooled,
     seconds,
 )
@@ -314,8 +315,7 @@ def runtimes(*axes: Axes, comparisons: dict[str, list[Comparison]]) -> None:
         ax.set_xticks(range(len(ticks)), ticks)
         ax.set_title(label)
         ax.grid(axis="x", visible=False)
-    handles, labels = time_ax.get_legend_handles_labels()
-    time_ax.figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    legend_below(time_ax, most=5)
     time_ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: seconds(value)))
 
 

@@ -8,9 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from relevance.scene import FAMILIES, PREDICATES, group_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 GROUPS = FAMILIES
 """Families, in the order in which tables and plots show them."""
@@ -150,3 +153,10 @@ def number(value: float | int | None, decimals: int = 0) -> str:
     if value is None or not math.isfinite(value):
         return DASH
     return f"{value:,.{decimals}f}".replace(",", "\u202f")
+
+
+def legend_below(ax: Axes, *, most: int = 4, **room: float) -> None:
+    """One legend under all panels, in rows of so many; room: matplotlib's spacings."""
+    handles, labels = ax.get_legend_handles_labels()
+    columns = min(most, max(1, len(labels)))
+    ax.figure.legend(handles, labels, loc="outside lower center", ncols=columns, **room)  # pyright: ignore[reportArgumentType]
